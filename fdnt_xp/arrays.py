@@ -1,0 +1,113 @@
+"""The door for arrays: which library they belong to, and that they agree.
+
+This is the only module that imports `array_api_compat` or `array_api_extra`. A public
+function calls `array_namespace` once, at its boundary, and hands `xp` down; kernels
+never learn which library they run on.
+"""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Any, TypeAlias
+
+import array_api_compat
+import numpy as np
+
+from fdnt_xp.errors import FdntTypeError, NamespaceError
+
+Array: TypeAlias = Any
+"""An array of any library that follows the Array API standard."""
+Device: TypeAlias = Any
+DType: TypeAlias = Any
+
+
+def array_namespace(**arrays: Array | None) -> ModuleType:
+    """Return the Array API namespace that all the named arrays share.
+
+    Parameters
+    ----------
+    **arrays : array or None
+        The arguments by name; None is passed over.
+
+    Raises
+    ------
+    FdntTypeError
+        If an argument is not an array.
+    NamespaceError
+        If two arguments belong to different libraries or devices; both are named.
+    """
+    first: tuple[str, ModuleType, Device] | None = None
+    for name, array in arrays.items():
+        if array is None:
+            continue
+        if not array_api_compat.is_array_api_obj(array):
+            raise FdntTypeError(
+                f"{name} must be an array (numpy, torch, jax, cupy, ...), "
+                f"not {type(array).__name__}"
+            )
+        xp = array_api_compat.array_namespace(array)
+        where = array_api_compat.device(array)
+        if first is None:
+            first = (name, xp, where)
+        elif xp is not first[1]:
+            raise NamespaceError(
+                f"{name} is a {_library(xp)} array but {first[0]} is a {_library(first[1])} "
+                "array; convert one of them, nothing is moved silently"
+            )
+        elif where != first[2]:
+            raise NamespaceError(
+                f"{name} is on device {where} but {first[0]} is on {first[2]}; move one of them"
+            )
+    if first is None:
+        raise FdntTypeError("at least one array is needed to choose the library")
+    return first[1]
+
+
+def require_dtype(dtype: DType, **arrays: Array | None) -> None:
+    """Raise `NamespaceError` if one of the named arrays is not of `dtype`."""
+    for name, array in arrays.items():
+        if array is not None and array.dtype != dtype:
+            raise NamespaceError(
+                f"{name} has dtype {array.dtype}, expected {dtype}; cast one of them"
+            )
+
+
+def as_floating(xp: ModuleType, array: Array, name: str) -> Array:
+    """Return `array` as real floating point, in native byte order and positive strides.
+
+    Integer and boolean arrays become the library's float64. NumPy arrays of foreign byte
+    order, as FITS readers give them, are swapped. Complex input is refused.
+    """
+    if isinstance(array, np.ndarray):
+        array = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("="))
+    if xp.isdtype(array.dtype, "complex floating"):
+        raise FdntTypeError(f"{name} must be real, but has dtype {array.dtype}")
+    if not xp.isdtype(array.dtype, "real floating"):
+        array = xp.astype(array, xp.float64)
+    elif array.dtype not in (xp.float32, xp.float64):
+        wider = xp.finfo(array.dtype).bits > 64
+        array = xp.astype(array, xp.float64 if wider else xp.float32)
+    return array
+
+
+def device_of(array: Array) -> Device:
+    """Return the device on which an array lives."""
+    return array_api_compat.device(array)
+
+
+def to_numpy(array: Array) -> np.ndarray[Any, Any]:
+    """Copy an array to the host. For results and reports, never inside a kernel."""
+    if array_api_compat.is_torch_array(array):
+        return np.array(array.numpy(force=True))
+    if array_api_compat.is_cupy_array(array):
+        return np.array(array.get())
+    try:
+        return np.array(array)
+    except (TypeError, RuntimeError, ValueError):
+        # array_api_strict refuses to export from its pretended devices: go through its CPU.
+        xp = array_api_compat.array_namespace(array)
+        return np.array(xp.asarray(array, device=xp.Device("CPU_DEVICE")))
+
+
+def _library(xp: ModuleType) -> str:
+    return xp.__name__.removeprefix("array_api_compat.").split(".")[0]

@@ -1,0 +1,84 @@
+"""Measurement flags: one integer per galaxy, each bit a named reason.
+
+Bits 0 to 13 keep the positions of the original FDNT code's flags, so that catalogs of
+both can be compared; those that this library never sets are not defined here. Bits from
+14 up are ours. A galaxy is measured when none of the bits in `FAILED` is set; the other
+bits tell how it was measured.
+"""
+
+from __future__ import annotations
+
+from enum import IntFlag
+from typing import Final
+
+
+class Flag(IntFlag):
+    """Why a galaxy was not measured, or what to know about its measurement."""
+
+    CENTROID_OFF_STAMP = 1 << 3
+    """The centroid left the stamp: there is no such galaxy here."""
+    SIZE_AT_BOUND = 1 << 4
+    """The size equation asked for a weight outside the bounds; it was held there."""
+    SIZE_FIXED = 1 << 5
+    """The size of the weight was given by the caller, not solved for."""
+    RADIUS_TOO_SMALL = 1 << 7
+    """The trust region shrank to nothing: no root near the start."""
+    DID_NOT_CONVERGE = 1 << 8
+    """The iteration limit was reached before the null tests vanished."""
+    SINGULAR = 1 << 9
+    """The null tests do not respond to the parameters at the solution."""
+    TOO_ELLIPTICAL = 1 << 12
+    """The root lies where the weight covers too little of k-space to trust it."""
+    NO_ATTEMPT = 1 << 14
+    """The galaxy was never measured (set until something clears it)."""
+    NON_FINITE_PIXEL = 1 << 15
+    """A pixel of the stamp is NaN or infinite."""
+    NO_SIGNAL = 1 << 16
+    """The stamp is constant, or its flux under the weight is not positive."""
+    BAD_PSF = 1 << 17
+    """The galaxy's own PSF is not finite, has no positive sum, or is too wide."""
+    NON_FINITE_RESULT = 1 << 18
+    """The null tests became NaN or infinite during the solution."""
+    FINE_GRID = 1 << 19
+    """Measured on the zero-padded k grid, because the galaxy is very elongated."""
+
+
+INFORMATION: Final = Flag.SIZE_AT_BOUND | Flag.SIZE_FIXED | Flag.FINE_GRID
+"""Bits that tell how a shape was measured; it may be used all the same."""
+
+FAILED: Final = ~INFORMATION & Flag(sum(int(flag) for flag in Flag))
+"""Bits with which eta is NaN."""
+
+
+def flag_names(value: int) -> list[str]:
+    """Return the names of the bits that are set in one flag value, lowest bit first.
+
+    Examples
+    --------
+    >>> from fdnt_xp.flags import flag_names
+    >>> flag_names((1 << 4) | (1 << 19))
+    ['SIZE_AT_BOUND', 'FINE_GRID']
+    """
+    return [flag.name or str(int(flag)) for flag in Flag if int(value) & int(flag)]
+
+
+def flag_text(name: str) -> str:
+    """Return the sentence that explains a flag, for tables and closing summaries."""
+    return _TEXT[name]
+
+
+_TEXT: Final[dict[str, str]] = {
+    "CENTROID_OFF_STAMP": "centroid outside the stamp",
+    "SIZE_AT_BOUND": "weight size held at its bound",
+    "SIZE_FIXED": "weight size given by the caller",
+    "RADIUS_TOO_SMALL": "trust region shrank to nothing",
+    "DID_NOT_CONVERGE": "iteration limit reached",
+    "SINGULAR": "null tests do not respond at the solution",
+    "TOO_ELLIPTICAL": "weight covers too little of k-space",
+    "NO_ATTEMPT": "never measured",
+    "NON_FINITE_PIXEL": "NaN or infinite pixel",
+    "NO_SIGNAL": "no positive flux",
+    "BAD_PSF": "unusable PSF",
+    "NON_FINITE_RESULT": "null tests not finite",
+    "FINE_GRID": "measured on the zero-padded k grid",
+}

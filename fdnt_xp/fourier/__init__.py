@@ -1,0 +1,1 @@
+"""From pixels to Fourier modes: the k grid, the transform, the PSF."""

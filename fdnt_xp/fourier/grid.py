@@ -1,0 +1,100 @@
+"""The half-plane k grid: which Fourier modes are used, and the monomials of k on them.
+
+A real image has `I~(-k) = I~(k)*`, so one half-plane holds everything: modes with kx > 0,
+and those with kx = 0 and ky > 0, count twice; k = 0 counts once. Only modes inside the
+disc `|k| < kmax` are kept. Every null test and every derivative of one is a sum over the
+disc of a weighted image times a monomial of k, so the grid carries those monomials as two
+small matrices, with the half-plane weight folded in.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import ModuleType
+
+import numpy as np
+
+from fdnt_xp.arrays import Array, Device, DType, array_namespace
+from fdnt_xp.shear import shear_matrix
+
+
+@dataclass(frozen=True, kw_only=True)
+class KGrid:
+    """Fourier modes inside a disc, for stamps of one shape.
+
+    Parameters
+    ----------
+    kx, ky : array, shape (n_k,)
+        Coordinates at which the tests are evaluated, rad/pixel. For a counter-sheared
+        grid these are `S_gamma k`, while `index` still names the modes k of the data.
+    fold : array, shape (n_k,)
+        Half-plane weight: 2, or 1 at k = 0.
+    index : array, shape (n_k,), integer
+        Position of the mode in the flattened `rfftn` of a stamp of `shape`.
+    shape : tuple of int
+        (ny, nx) of the transform; larger than the stamp where the grid is zero-padded.
+    """
+
+    kx: Array
+    ky: Array
+    fold: Array
+    index: Array
+    shape: tuple[int, int]
+
+    @property
+    def n_k(self) -> int:
+        """Number of modes."""
+        return int(self.kx.shape[0])
+
+    @property
+    def squares(self) -> Array:
+        """`kx², kx ky, ky²` without the half-plane weight, shape (3, n_k)."""
+        xp = array_namespace(kx=self.kx)
+        return xp.stack([self.kx**2, self.kx * self.ky, self.ky**2], axis=0)
+
+    def monomials(self, degree: int) -> Array:
+        """Return `fold * kx^(d-j) ky^j`, j = 0 .. d, shape (n_k, degree + 1)."""
+        xp = array_namespace(kx=self.kx)
+        columns = [self.fold * self.kx ** (degree - j) * self.ky**j for j in range(degree + 1)]
+        return xp.stack(columns, axis=-1)
+
+    def sheared(self, gamma: Array) -> KGrid:
+        """Return the same modes with coordinates `kappa = S_gamma k`: a counter-shear.
+
+        Evaluating any test on the returned grid measures the galaxy with the shear `gamma`
+        (eta-type, shape (2,)) taken off, exactly: no image is resampled.
+        """
+        matrix = shear_matrix(gamma)
+        return KGrid(
+            kx=matrix[0, 0] * self.kx + matrix[0, 1] * self.ky,
+            ky=matrix[1, 0] * self.kx + matrix[1, 1] * self.ky,
+            fold=self.fold,
+            index=self.index,
+            shape=self.shape,
+        )
+
+
+def half_plane_disc(
+    xp: ModuleType, shape: tuple[int, int], kmax: float, *, dtype: DType, device: Device
+) -> KGrid:
+    """Return the modes of an (ny, nx) transform with `|k| < kmax` (rad/pixel).
+
+    `kmax` must not exceed pi: the Nyquist modes of even sizes are their own conjugates and
+    would need another weight. The selection is made on the host, where its size is known;
+    it depends on the geometry alone, never on data.
+    """
+    ny, nx = shape
+    ky, kx = np.meshgrid(
+        2.0 * np.pi * np.fft.fftfreq(ny), 2.0 * np.pi * np.fft.rfftfreq(nx), indexing="ij"
+    )
+    in_half_plane = (kx > 0) | ((kx == 0) & (ky >= 0))
+    index = np.flatnonzero(in_half_plane & (np.hypot(kx, ky) < kmax))
+    kx, ky = kx.ravel()[index], ky.ravel()[index]
+    fold = np.where((kx == 0) & (ky == 0), 1.0, 2.0)
+    return KGrid(
+        kx=xp.asarray(kx, dtype=dtype, device=device),
+        ky=xp.asarray(ky, dtype=dtype, device=device),
+        fold=xp.asarray(fold, dtype=dtype, device=device),
+        index=xp.asarray(index, dtype=xp.int64, device=device),
+        shape=shape,
+    )

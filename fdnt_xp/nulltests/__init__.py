@@ -1,0 +1,1 @@
+"""The null tests: sheared weights, the tests with derivatives and noise, the root finder."""

@@ -1,0 +1,1 @@
+"""The shape of one galaxy, for a batch of them."""

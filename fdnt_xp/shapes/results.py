@@ -1,0 +1,143 @@
+"""What a shape measurement returns: one row per galaxy, in the library it was asked in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any
+
+from fdnt_xp.arrays import Array, array_namespace, to_numpy
+from fdnt_xp.flags import FAILED
+
+if TYPE_CHECKING:
+    import numpy as np
+    from astropy.table import Table
+from fdnt_xp.shear import distortion_from_eta, reduced_shear_from_eta
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShapeResult:
+    """Shapes of a batch of galaxies.
+
+    All arrays share one library, dtype and device, that of the stamps; row i is galaxy i.
+    Where `flags` holds a bit of `fdnt_xp.flags.FAILED`, the float columns are NaN.
+
+    Parameters
+    ----------
+    eta : array, shape (n_gal, 2)
+        Conformal shear of the galaxy before the PSF: `a/b = exp(|eta|)`.
+    eta_cov : array, shape (n_gal, 2, 2)
+        Covariance of `eta` from the pixel noise; NaN if no noise variance was given.
+    centroid : array, shape (n_gal, 2)
+        (x, y) in pixels of the stamp, 0-based, integer at pixel centres.
+    size : array, shape (n_gal,)
+        sigma_g of the Gaussian factor of the weight, in pixels, in the frame where the
+        galaxy is round.
+    flux : array, shape (n_gal,)
+        Amplitude of the best Gaussian galaxy of this size and shape, in units of the image.
+    snr : array, shape (n_gal,)
+        `flux` over its error; NaN if no noise variance was given.
+    flags : array, shape (n_gal,), int32
+        Bits of `fdnt_xp.flags.Flag`.
+    n_iter : array, shape (n_gal,), int32
+        Evaluations of the null tests.
+    status : array, shape (n_gal,), int32
+        Status of the solver, `fdnt_xp.nulltests.dogleg.Status`.
+    """
+
+    eta: Array
+    eta_cov: Array
+    centroid: Array
+    size: Array
+    flux: Array
+    snr: Array
+    flags: Array
+    n_iter: Array
+    status: Array
+
+    @property
+    def n_gal(self) -> int:
+        """Number of galaxies, measured or not."""
+        return int(self.eta.shape[0])
+
+    @property
+    def e(self) -> Array:
+        """Distortion `e = (a² - b²)/(a² + b²)`, shape (n_gal, 2)."""
+        return distortion_from_eta(self.eta)
+
+    @property
+    def g(self) -> Array:
+        """Reduced shear `g = (a - b)/(a + b)`, shape (n_gal, 2)."""
+        return reduced_shear_from_eta(self.eta)
+
+    @property
+    def measured(self) -> Array:
+        """True where the galaxy has a shape, shape (n_gal,), bool."""
+        xp = array_namespace(flags=self.flags)
+        return xp.bitwise_and(self.flags, xp.full_like(self.flags, int(FAILED))) == 0
+
+    def take(self, rows: Array) -> ShapeResult:
+        """Return the galaxies with the given row numbers (integer array), in that order."""
+        xp = array_namespace(eta=self.eta, rows=rows)
+        return ShapeResult(
+            **{f.name: xp.take(getattr(self, f.name), rows, axis=0) for f in fields(self)}
+        )
+
+    def to_numpy(self) -> ShapeResult:
+        """Return the same result with NumPy arrays, copied to the host."""
+        return ShapeResult(**{f.name: to_numpy(getattr(self, f.name)) for f in fields(self)})
+
+    def to_table(self) -> Table:
+        """Return the result as an `astropy.table.Table`, with units and descriptions.
+
+        Vectors are spread over scalar columns (`eta1`, `eta2`, ...), as survey catalogs
+        have them; `e1`, `g1` and their companions are added.
+        """
+        from astropy.table import Table
+
+        host = self.to_numpy()
+        columns: dict[str, np.ndarray[Any, Any]] = {
+            "x": host.centroid[:, 0],
+            "y": host.centroid[:, 1],
+            "eta1": host.eta[:, 0],
+            "eta2": host.eta[:, 1],
+            "eta1_var": host.eta_cov[:, 0, 0],
+            "eta2_var": host.eta_cov[:, 1, 1],
+            "eta12_cov": host.eta_cov[:, 0, 1],
+            "e1": host.e[:, 0],
+            "e2": host.e[:, 1],
+            "g1": host.g[:, 0],
+            "g2": host.g[:, 1],
+            "size": host.size,
+            "flux": host.flux,
+            "snr": host.snr,
+            "flags": host.flags,
+            "n_iter": host.n_iter,
+            "status": host.status,
+        }
+        table = Table(columns)
+        for name, (unit, description) in COLUMNS.items():
+            table[name].unit = unit
+            table[name].description = description
+        return table
+
+
+COLUMNS: dict[str, tuple[str | None, str]] = {
+    "x": ("pix", "centroid along columns, 0-based, integer at pixel centres"),
+    "y": ("pix", "centroid along rows, 0-based, integer at pixel centres"),
+    "eta1": (None, "conformal shear, component along x; a/b = exp(|eta|)"),
+    "eta2": (None, "conformal shear, component along the diagonal"),
+    "eta1_var": (None, "variance of eta1 from pixel noise"),
+    "eta2_var": (None, "variance of eta2 from pixel noise"),
+    "eta12_cov": (None, "covariance of eta1 and eta2 from pixel noise"),
+    "e1": (None, "distortion (a^2-b^2)/(a^2+b^2), component 1"),
+    "e2": (None, "distortion, component 2"),
+    "g1": (None, "reduced shear (a-b)/(a+b), component 1"),
+    "g2": (None, "reduced shear, component 2"),
+    "size": ("pix", "sigma of the Gaussian factor of the weight"),
+    "flux": (None, "flux of the matched Gaussian galaxy, in units of the image"),
+    "snr": (None, "flux over its error"),
+    "flags": (None, "measurement flags, bits of fdnt_xp.flags.Flag"),
+    "n_iter": (None, "evaluations of the null tests"),
+    "status": (None, "status of the solver"),
+}
+"""Unit and description of every column of `ShapeResult.to_table`."""

@@ -1,0 +1,1 @@
+"""The shear of a population, from the shapes of its galaxies."""
