@@ -14,6 +14,7 @@ and lensing by it gives `I_lensed(x) = I(S^-1 x)`, hence `I_lensed~(k) = I~(S k)
 
 from __future__ import annotations
 
+import math
 from types import ModuleType
 
 from fdnt_xp.arrays import Array, array_namespace
@@ -86,6 +87,27 @@ def hyperbolic_series(xp: ModuleType, x_squared: Array) -> tuple[Array, Array, A
         small, 0.5 + x_squared / 24.0 * (1.0 + x_squared / 30.0), 2.0 * sinh_half**2 / safe
     )
     return 1.0 + x_squared * coshc, sinhc, coshc
+
+
+def hyperbolic_slopes(xp: ModuleType, x_squared: Array) -> tuple[Array, Array]:
+    """Return `(d/dx)/x` of `sinh x / x` and of `(cosh x - 1)/x²`, as functions of `x²`.
+
+    They are `(cosh x - sinh x / x)/x²` and `(sinh x / x - 2 (cosh x - 1)/x²)/x²`: differences
+    of nearly equal numbers, so the series is used up to `x² = 1`.
+    """
+    small = x_squared < 1.0
+    safe = xp.where(small, xp.ones_like(x_squared), x_squared)
+    cosh, sinhc, coshc = hyperbolic_series(xp, safe)
+    sinhc_slope = xp.zeros_like(x_squared)
+    coshc_slope = xp.zeros_like(x_squared)
+    # sum over n >= 1 of 2n x^(2n-2) / (2n + 1)! and of 2n x^(2n-2) / (2n + 2)!.
+    for n in range(9, 0, -1):
+        sinhc_slope = sinhc_slope * x_squared + 2 * n / math.factorial(2 * n + 1)
+        coshc_slope = coshc_slope * x_squared + 2 * n / math.factorial(2 * n + 2)
+    return (
+        xp.where(small, sinhc_slope, (cosh - sinhc) / safe),
+        xp.where(small, coshc_slope, (sinhc - 2.0 * coshc) / safe),
+    )
 
 
 def _rescale(vector: Array, function: str, inner: float) -> Array:

@@ -10,6 +10,7 @@ small matrices, with the half-plane weight folded in.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from types import ModuleType
 
 import numpy as np
@@ -46,16 +47,50 @@ class KGrid:
         """Number of modes."""
         return int(self.kx.shape[0])
 
-    @property
+    @cached_property
     def squares(self) -> Array:
         """`kx², kx ky, ky²` without the half-plane weight, shape (3, n_k)."""
         xp = array_namespace(kx=self.kx)
         return xp.stack([self.kx**2, self.kx * self.ky, self.ky**2], axis=0)
 
-    def monomials(self, degree: int) -> Array:
-        """Return `fold * kx^(d-j) ky^j`, j = 0 .. d, shape (n_k, degree + 1)."""
+    def even_moments(self, field: Array) -> tuple[Array, Array, Array]:
+        """Return the moments of degree 0, 2 and 4 of a field that is even in k.
+
+        Parameters
+        ----------
+        field : array, shape (n_gal, n_k)
+
+        Returns
+        -------
+        tuple of arrays, shapes (n_gal, 1), (n_gal, 3) and (n_gal, 5)
+            `sum_k field kx^(d-j) ky^j`, j = 0 .. d, over the whole plane.
+        """
+        xp = array_namespace(field=field)
+        moments = xp.matmul(field, self._even)
+        return moments[:, :1], moments[:, 1:4], moments[:, 4:]
+
+    def odd_moments(self, field: Array) -> tuple[Array, Array]:
+        """Return the moments of degree 1 and 3 of an odd field, shapes (n_gal, 2), (n_gal, 4)."""
+        xp = array_namespace(field=field)
+        moments = xp.matmul(field, self._odd)
+        return moments[:, :2], moments[:, 2:]
+
+    @cached_property
+    def _even(self) -> Array:
+        return self._monomials(0, 2, 4)
+
+    @cached_property
+    def _odd(self) -> Array:
+        return self._monomials(1, 3)
+
+    def _monomials(self, *degrees: int) -> Array:
+        """Return `fold kx^(d-j) ky^j`, j = 0 .. d, for each degree, side by side."""
         xp = array_namespace(kx=self.kx)
-        columns = [self.fold * self.kx ** (degree - j) * self.ky**j for j in range(degree + 1)]
+        columns = [
+            self.fold * self.kx ** (degree - j) * self.ky**j
+            for degree in degrees
+            for j in range(degree + 1)
+        ]
         return xp.stack(columns, axis=-1)
 
     def sheared(self, gamma: Array) -> KGrid:

@@ -23,6 +23,13 @@ class CubicTable:
     coefficients: tuple[Array, Array, Array, Array]
     n_cell: int
 
+    def take(self, rows: Array) -> CubicTable:
+        """Return the tables with the given row numbers (integer array), in that order."""
+        xp = array_namespace(rows=rows)
+        tables = (xp.reshape(c, (-1, self.n_cell + 1)) for c in self.coefficients)
+        c0, c1, c2, c3 = (xp.reshape(xp.take(c, rows, axis=0), (-1,)) for c in tables)
+        return CubicTable(coefficients=(c0, c1, c2, c3), n_cell=self.n_cell)
+
     def evaluate(self, t: Array, row: Array | None = None) -> tuple[Array, Array]:
         """Return the function and its derivative d/dt at `t` >= 0, both of the shape of `t`.
 

@@ -53,7 +53,7 @@ def deconvolve(stamps: Array, inverse_transfer: Array, grid: KGrid) -> Deconvolv
     stamps : array, shape (n_gal, ny, nx), real floating
         Finite pixels.
     inverse_transfer : array, shape (n_gal or 1, n_k), complex
-        `1/T(k)` about the centre of the PSF image, from `Psf.inverse_transfer`.
+        `1/T(k)` about the flux centroid of the PSF, from `Psf.inverse_transfer`.
     grid : KGrid
         Its `shape` is that of the stamps, or larger: then they are padded with zeros.
     """
@@ -62,25 +62,44 @@ def deconvolve(stamps: Array, inverse_transfer: Array, grid: KGrid) -> Deconvolv
     spectrum = xp.fft.rfftn(stamps, s=grid.shape, axes=(-2, -1))
     spectrum = xp.reshape(spectrum, (n_gal, grid.shape[0] * (grid.shape[1] // 2 + 1)))
     spectrum = xp.take(spectrum, grid.index, axis=1)
-    # exp(+i k.c) moves the origin from pixel (0, 0) to the centre of the stamp.
-    centre = mode_phase(grid, 0.5 * (nx - 1), 0.5 * (ny - 1))
-    spectrum = spectrum * (inverse_transfer * centre[None, :])
+    # Pixel (0, 0) is at -middle from the centre of the stamp, which is where x = 0.
+    middle = xp.asarray(
+        [[-0.5 * (nx - 1), -0.5 * (ny - 1)]], dtype=stamps.dtype, device=device_of(stamps)
+    )
+    spectrum = spectrum * (inverse_transfer / mode_phase(grid, middle))
     return DeconvolvedStamps(re=xp.real(spectrum), im=xp.imag(spectrum))
 
 
-def mode_phase(grid: KGrid, x: float, y: float) -> Array:
-    """Return `exp(+i k.x)` on the modes of the data, shape (n_k,), complex.
-
-    Uses the modes named by `grid.index`, not `grid.kx`: a counter-sheared grid has other
-    coordinates for the same data.
-    """
+def half_plane_axes(grid: KGrid) -> tuple[Array, Array]:
+    """Return kx (nx//2 + 1,) and ky (ny,) of the `rfftn` of the grid, in rad/pixel."""
     xp = array_namespace(kx=grid.kx)
     device = device_of(grid.kx)
     ny, nx = grid.shape
-    ky = xp.fft.fftfreq(ny, dtype=grid.kx.dtype, device=device)
     kx = xp.fft.rfftfreq(nx, dtype=grid.kx.dtype, device=device)
-    turns = x * kx[None, :] + y * ky[:, None]
-    # Whole turns are taken off first: cos(2 pi t) of a large t costs float32 its digits.
-    angle = 2.0 * xp.pi * xp.take(xp.reshape(turns - xp.round(turns), (-1,)), grid.index, axis=0)
-    complex_dtype = xp.complex64 if angle.dtype == xp.float32 else xp.complex128
-    return xp.exp(1j * xp.astype(angle, complex_dtype))
+    ky = xp.fft.fftfreq(ny, dtype=grid.kx.dtype, device=device)
+    return 2.0 * xp.pi * kx, 2.0 * xp.pi * ky
+
+
+def mode_phase(grid: KGrid, position: Array) -> Array:
+    """Return `exp(+i k.x)` on the modes of the data, shape (n, n_k), complex.
+
+    Uses the modes named by `grid.index`, not `grid.kx`: a counter-sheared grid has other
+    coordinates for the same data.
+
+    Parameters
+    ----------
+    position : array, shape (n, 2)
+        x in pixels.
+    """
+    xp = array_namespace(position=position)
+    kx, ky = half_plane_axes(grid)
+    along_x = xp.exp(complex_like(position[:, 0:1] * kx) * 1j)
+    along_y = xp.exp(complex_like(position[:, 1:2] * ky) * 1j)
+    phase = along_y[:, :, None] * along_x[:, None, :]
+    return xp.take(xp.reshape(phase, (int(position.shape[0]), -1)), grid.index, axis=1)
+
+
+def complex_like(array: Array) -> Array:
+    """Return a real array as complex of the same precision."""
+    xp = array_namespace(array=array)
+    return xp.astype(array, xp.complex64 if array.dtype == xp.float32 else xp.complex128)

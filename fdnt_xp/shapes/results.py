@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
-from fdnt_xp.arrays import Array, array_namespace, to_numpy
-from fdnt_xp.flags import FAILED
+from fdnt_xp.arrays import Array, array_namespace, device_of, to_numpy
+from fdnt_xp.flags import FAILED, Flag
+from fdnt_xp.nulltests.dogleg import Status
 
 if TYPE_CHECKING:
     import numpy as np
@@ -53,6 +55,39 @@ class ShapeResult:
     flags: Array
     n_iter: Array
     status: Array
+
+    @classmethod
+    def unmeasured(cls, stamps: Array) -> ShapeResult:
+        """Return NaN and `NO_ATTEMPT` for each stamp, in the stamps' dtype and place."""
+        xp = array_namespace(stamps=stamps)
+        n_gal = int(stamps.shape[0])
+        device = device_of(stamps)
+
+        def nan(*shape: int) -> Array:
+            return xp.full((n_gal, *shape), float("nan"), dtype=stamps.dtype, device=device)
+
+        def code(value: int) -> Array:
+            return xp.full((n_gal,), value, dtype=xp.int32, device=device)
+
+        return cls(
+            eta=nan(2),
+            eta_cov=nan(2, 2),
+            centroid=nan(2),
+            size=nan(),
+            flux=nan(),
+            snr=nan(),
+            flags=code(int(Flag.NO_ATTEMPT)),
+            n_iter=code(0),
+            status=code(int(Status.RUNNING)),
+        )
+
+    @classmethod
+    def concat(cls, parts: Sequence[ShapeResult]) -> ShapeResult:
+        """Join results, at least one, in the order given."""
+        xp = array_namespace(eta=parts[0].eta)
+        return cls(
+            **{f.name: xp.concat([getattr(p, f.name) for p in parts], axis=0) for f in fields(cls)}
+        )
 
     @property
     def n_gal(self) -> int:

@@ -1,0 +1,279 @@
+"""The PSF in Fourier space: its transfer function, and the circular weight made from it.
+
+The image of a star, pixel response included, is all that is needed. Its transform `T(k)` is
+evaluated by direct trigonometric sums, exact at any k: the star may sit anywhere in its
+array, of any size, finer sampled than the galaxies if `oversampling` says so.
+
+`𝒯(k) = <|T|^-2>_θ^-1` (B10, eq. 21, with the exponent corrected; docs, "Weight of the
+PSF") is the part of the null tests' weight that knows the PSF. It ends at `kmax`, where it
+falls below a floor or the grid ends, and it ends smoothly: a hard edge costs 1e-4 in e.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from fdnt_xp.arrays import Array, array_namespace, as_floating, device_of
+from fdnt_xp.errors import FdntValueError, RangeError, ShapeMismatchError
+from fdnt_xp.fourier.grid import KGrid
+from fdnt_xp.fourier.interpolation import CubicTable, cubic_table
+from fdnt_xp.fourier.transform import complex_like, half_plane_axes, mode_phase
+
+_SCAN_RADII, _SCAN_ANGLES = 48, 12
+"""Circles on which the end of 𝒯 is looked for, and points on half of each."""
+_TABLE_NODES, _TABLE_ANGLES = 97, 24
+"""Nodes of the table of 𝒯. The mean over the angle need not be exact: any isotropic weight
+gives a valid null test. It must be smooth in k, which it is for any number of angles."""
+_PSFS_AT_ONCE = 64
+"""Bounds the memory of the trigonometric sums."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Psf:
+    """One PSF for all galaxies, or one for each. Made by `Psf.from_image`.
+
+    Parameters
+    ----------
+    image : array, shape (n_psf, ny, nx)
+        Stars of unit flux.
+    centre : array, shape (n_psf, 2)
+        Flux centroids (x, y), in pixels of `image` from the middle of the array.
+    kmax : array, shape (n_psf,)
+        Where the weight ends, rad/pixel of the galaxies.
+    usable : array, shape (n_psf,), bool
+        False where an image is not finite or has no positive sum.
+    weight : CubicTable
+        `𝒯` as a function of `k/kmax`, one table per PSF.
+    oversampling : float
+        Pixels of `image` per pixel of the galaxies, along one axis.
+    largest_kmax : float
+        The largest `kmax`, on the host.
+    """
+
+    image: Array
+    centre: Array
+    kmax: Array
+    usable: Array
+    weight: CubicTable
+    oversampling: float
+    largest_kmax: float
+
+    @classmethod
+    def from_image(cls, image: Array, *, oversampling: float = 1.0, floor: float = 1e-6) -> Psf:
+        """Take the PSF from the image of a star, or from a stack of such images.
+
+        Parameters
+        ----------
+        image : array, shape (ny, nx) or (n_gal, ny, nx)
+            One star for all galaxies or one for each; pixel response included. Any
+            normalisation with a positive sum, centred anywhere: centroids of galaxies
+            are counted from the flux centroid of the star. The result has its library,
+            dtype and device; integers become float64.
+        oversampling : float
+            Pixels of `image` per pixel of the galaxies, along one axis. The pixel response
+            in the image must be that of the galaxies' pixels.
+        floor : float
+            The weight ends where `𝒯` first falls below this, in units of `𝒯(0) = 1`.
+
+        Raises
+        ------
+        ShapeMismatchError
+            If `image` has another rank, or an axis of length 0.
+        RangeError
+            If `oversampling` or `floor` is out of range.
+        FdntValueError
+            If a single image is not finite or has no positive sum. In a stack such an
+            image is marked instead, and its galaxy flagged `BAD_PSF`.
+        """
+        xp = array_namespace(image=image)
+        image = as_floating(xp, image, "image")
+        if image.ndim not in (2, 3) or 0 in image.shape[-2:]:
+            raise ShapeMismatchError(
+                f"image must have the shape (ny, nx) or (n_gal, ny, nx), not {image.shape}"
+            )
+        if not 0.0 < floor < 1.0:
+            raise RangeError("floor", floor, 0.0, 1.0)
+        if not (np.isfinite(oversampling) and oversampling > 0.0):
+            raise RangeError("oversampling", oversampling, 0.0, None)
+        single = image.ndim == 2
+        image = image[None, ...] if single else image
+        image, usable = _normalised(image)
+        if single and not bool(xp.all(usable)):
+            raise FdntValueError("image must be finite, with a positive sum, to serve as the PSF")
+        centre = _flux_centroid(image)
+        n_psf = int(image.shape[0])
+        parts = []
+        for start in range(0, max(n_psf, 1), _PSFS_AT_ONCE):
+            rows = slice(start, min(start + _PSFS_AT_ONCE, n_psf))
+            parts.append(_circularise(image[rows, :, :], float(oversampling), floor))
+        kmax = xp.concat([part[0] for part in parts])
+        weight = xp.concat([part[1] for part in parts])
+        return cls(
+            image=image,
+            centre=centre / oversampling,
+            kmax=kmax,
+            usable=usable,
+            weight=cubic_table(weight, zero_beyond=True),
+            oversampling=float(oversampling),
+            largest_kmax=float(xp.max(kmax)) if n_psf else float(np.pi),
+        )
+
+    @property
+    def n_psf(self) -> int:
+        """Number of PSFs: 1 for all galaxies, or one for each."""
+        return int(self.image.shape[0])
+
+    def take(self, rows: Array) -> Psf:
+        """Return the PSFs with the given row numbers (integer array), in that order."""
+        xp = array_namespace(image=self.image, rows=rows)
+        moved = ("image", "centre", "kmax", "usable")
+        kept = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in moved}
+        taken = {name: xp.take(getattr(self, name), rows, axis=0) for name in moved}
+        return Psf(**(kept | taken | {"weight": self.weight.take(rows)}))
+
+    def restricted(self, least_kmax: float) -> Psf:
+        """Return the PSFs with those marked unusable whose weight ends before `least_kmax`."""
+        return replace(self, usable=self.usable & (self.kmax >= least_kmax))
+
+    def transfer(self, grid: KGrid) -> Array:
+        """Return `T(k)` about the flux centroid on the modes of a grid; T(0) = 1.
+
+        Returns
+        -------
+        array, shape (n_psf, n_k), complex
+        """
+        xp = array_namespace(image=self.image)
+        ny, nx = self.image.shape[1:]
+        kx, ky = half_plane_axes(grid)
+        along_x = _waves(kx, nx, self.oversampling)
+        along_y = _waves(ky, ny, self.oversampling)
+        # exp(-i k.x) separates: T = along_y @ image @ along_x^T on the whole half plane.
+        image = xp.astype(self.image, along_x.dtype)
+        half_plane = xp.matmul(xp.matmul(along_y, image), xp.matrix_transpose(along_x))
+        modes = xp.take(xp.reshape(half_plane, (self.n_psf, -1)), grid.index, axis=1)
+        return modes * mode_phase(grid, self.centre)
+
+    def inverse_transfer(self, grid: KGrid) -> Array:
+        """Return `1/T(k)` inside each PSF's own disc `|k| < kmax`, and zero outside.
+
+        Returns
+        -------
+        array, shape (n_psf, n_k), complex
+        """
+        xp = array_namespace(image=self.image)
+        transfer = self.transfer(grid)
+        radius = xp.sqrt(grid.kx**2 + grid.ky**2)
+        inside = (radius[None, :] < self.kmax[:, None]) & (xp.abs(transfer) > 0)
+        one = xp.ones_like(transfer)
+        return xp.where(inside, one / xp.where(inside, transfer, one), xp.zeros_like(transfer))
+
+
+def _normalised(image: Array) -> tuple[Array, Array]:
+    """Return the stars at unit flux and which are usable; the others become a point."""
+    xp = array_namespace(image=image)
+    ny, nx = image.shape[1:]
+    total = xp.sum(xp.sum(image, axis=-1), axis=-1)
+    usable = xp.isfinite(total) & (total > 0)
+    safe = xp.where(usable, total, xp.ones_like(total))
+    pixel = xp.arange(ny * nx, dtype=xp.int64, device=device_of(image))
+    middle = xp.reshape(pixel == (ny // 2) * nx + nx // 2, (1, ny, nx))
+    point = xp.broadcast_to(xp.astype(middle, image.dtype), image.shape)
+    return xp.where(usable[:, None, None], image / safe[:, None, None], point), usable
+
+
+def _positions(n: int, like: Array) -> Array:
+    """Return the coordinates of n pixels from the middle of their array."""
+    xp = array_namespace(like=like)
+    return xp.arange(n, dtype=like.dtype, device=device_of(like)) - 0.5 * (n - 1)
+
+
+def _flux_centroid(image: Array) -> Array:
+    """Return (x, y) from the middle of the array, shape (n_psf, 2), for stars of unit flux."""
+    xp = array_namespace(image=image)
+    ny, nx = image.shape[1:]
+    x = xp.sum(xp.sum(image, axis=1) * _positions(nx, image), axis=-1)
+    y = xp.sum(xp.sum(image, axis=2) * _positions(ny, image), axis=-1)
+    return xp.stack([x, y], axis=-1)
+
+
+def _waves(k: Array, n: int, oversampling: float) -> Array:
+    """Return `exp(-i k x)`, shape (n_k, n), x in galaxy pixels from the middle of the array."""
+    xp = array_namespace(k=k)
+    angle = k[:, None] * (_positions(n, k) / oversampling)[None, :]
+    return xp.exp(complex_like(angle) * -1j)
+
+
+def _circularise(image: Array, oversampling: float, floor: float) -> tuple[Array, Array]:
+    """Return `kmax`, shape (n_psf,), and `𝒯` at the table's nodes, shape (n_psf, n_node)."""
+    xp = array_namespace(image=image)
+    like = {"dtype": image.dtype, "device": device_of(image)}
+    scan = xp.linspace(0.0, np.pi, _SCAN_RADII, **like)[None, :]
+    kmax = _first_crossing(scan, _mean_power(image, scan, _SCAN_ANGLES, oversampling), floor)
+    t = xp.linspace(0.0, 1.0, _TABLE_NODES, **like)[None, :]
+    power = _mean_power(image, kmax[:, None] * t, _TABLE_ANGLES, oversampling)
+    return kmax, _ended_smoothly(power)
+
+
+def _mean_power(image: Array, radii: Array, n_angle: int, oversampling: float) -> Array:
+    """Return `<|T|^-2>_θ^-1` on circles, shape (n_psf, n_radius).
+
+    `radii` (n_psf or 1, n_radius) are in rad/pixel of the galaxies. |T| is the same at k
+    and -k, so half a circle is enough; on equidistant points of it the mean converges
+    exponentially.
+    """
+    xp = array_namespace(image=image)
+    ny, nx = image.shape[1:]
+    angle = np.pi * (np.arange(n_angle) + 0.5) / n_angle
+    like = {"dtype": image.dtype, "device": device_of(image)}
+    cos, sin = (xp.asarray(f(angle), **like) for f in (np.cos, np.sin))
+    points = (int(radii.shape[0]), -1, 1)
+    kx = xp.reshape(radii[:, :, None] * cos, points)
+    ky = xp.reshape(radii[:, :, None] * sin, points)
+    phase_x = kx * (_positions(nx, image) / oversampling)
+    phase_y = ky * (_positions(ny, image) / oversampling)
+    cos_y, sin_y = xp.cos(phase_y), xp.sin(phase_y)
+    rows = xp.matrix_transpose(image)
+    cos_sum = xp.matmul(xp.cos(phase_x), rows)
+    sin_sum = xp.matmul(xp.sin(phase_x), rows)
+    re = xp.sum(cos_sum * cos_y - sin_sum * sin_y, axis=-1)
+    im = xp.sum(cos_sum * sin_y + sin_sum * cos_y, axis=-1)
+    power = xp.reshape(re**2 + im**2, (int(image.shape[0]), -1, n_angle))
+    dark = xp.any(power <= 0, axis=-1)
+    inverse = xp.mean(1.0 / xp.where(power > 0, power, xp.ones_like(power)), axis=-1)
+    return xp.where(dark, xp.zeros_like(inverse), 1.0 / inverse)
+
+
+def _first_crossing(radii: Array, power: Array, floor: float) -> Array:
+    """Return the first radius where `power` falls below `floor`, or the last; (n_psf,)."""
+    xp = array_namespace(power=power)
+    n_psf = int(power.shape[0])
+    radii = xp.broadcast_to(radii, power.shape)
+    # A radius counts as reached until the first crossing; ln P is nearly linear in a cell.
+    above = xp.astype(power >= floor, xp.int64)
+    reached = xp.sum(xp.cumulative_prod(above, axis=1), axis=1)
+    last = int(power.shape[1]) - 1
+    right = xp.minimum(reached, xp.full_like(reached, last))[:, None]
+    left = right - 1
+    tiny = xp.full_like(power, floor * 1e-6)
+    excess = xp.log(xp.maximum(power, tiny) / floor)
+    r0, r1 = (xp.take_along_axis(radii, i, axis=1) for i in (left, right))
+    e0, e1 = (xp.take_along_axis(excess, i, axis=1) for i in (left, right))
+    found = (reached <= last)[:, None]
+    fraction = xp.where(found, e0 / xp.where(found, e0 - e1, xp.ones_like(e0)), xp.ones_like(e0))
+    return xp.reshape(r0 + fraction * (r1 - r0), (n_psf,))
+
+
+def _ended_smoothly(power: Array) -> Array:
+    """Return `P (1 - P_end/P)²`: zero with its derivative at the end, P itself far above it.
+
+    Being a function of P, it is as smooth in k as P is: tapers in k, whose higher
+    derivatives jump where they begin, cost up to 30 times more accuracy.
+    """
+    xp = array_namespace(power=power)
+    end = power[:, -1:]
+    positive = power > 0
+    safe = xp.where(positive, power, xp.ones_like(power))
+    excess = xp.where(positive, 1.0 - end / safe, xp.zeros_like(power))
+    return power * xp.maximum(excess, xp.zeros_like(power)) ** 2

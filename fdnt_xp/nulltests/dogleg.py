@@ -1,0 +1,419 @@
+"""Powell's dogleg for many small systems of equations at once; it knows no galaxy.
+
+Every row of a batch is a system `f(x) = 0` of d equations with its own trust region, status
+and counters: it gives the same bits alone and in any batch, whatever becomes of its mates.
+The merit is `|f|²/2`. A row whose Jacobian is singular follows the gradient of the merit. A
+trial point where `f` or its Jacobian is not finite is a rejected step. Data never raise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from enum import IntEnum
+from functools import reduce
+from operator import add
+from types import ModuleType
+from typing import Final, Protocol, Self
+
+from fdnt_xp.arrays import Array, array_namespace, as_floating, device_of, require_dtype
+from fdnt_xp.errors import FdntValueError, RangeError, ShapeMismatchError
+
+# Nocedal & Wright 2006, algorithm 4.1, for the ratio of the real to the promised reduction
+# of the merit; they leave _ACCEPT free in [0, 1/4).
+_ACCEPT: Final = 1e-4
+_SHRINK_BELOW, _SHRINK = 0.25, 0.25
+_GROW_ABOVE, _GROW = 0.75, 2.0
+_AT_BOUNDARY: Final = 0.99  # of the radius: such a step was held back by it
+_SHRINK_OUTSIDE: Final = 0.1  # outside the domain there is no ratio, and the model is no guide
+_SINGULAR: Final = 10.0  # eps: smallest pivot, in a row scaled to 1, of a matrix worth solving
+_FLAT: Final = 4.0  # eps: a smaller promised part of the merit is its rounding
+_ROUNDING: Final = 100.0  # ftol: |f| at which a row that cannot move is taken for a root
+_MAX_UNKNOWNS: Final = 6  # the small algebra is written out, which does not pay for more
+
+
+class RootProblem(Protocol):
+    """A batch of systems of equations, one per row."""
+
+    def evaluate(self, x: Array) -> tuple[Array, Array]:
+        """Return `f(x)`, shape (n, d), and its Jacobian `df_i/dx_j`, shape (n, d, d).
+
+        `x` has shape (n, d), n the rows of this problem. NaN says that x is outside the
+        domain. One `ftol` must suit all f_i, one radius all x_j: scale them.
+        """
+        ...
+
+    def take(self, rows: Array) -> RootProblem:
+        """Return the problem of these rows (integer array) of this one, in that order."""
+        ...
+
+
+class Status(IntEnum):
+    """How the search for a root ended. CONVERGED is the only success."""
+
+    RUNNING = -1
+    CONVERGED = 0
+    MAX_ITER = 1
+    RADIUS_TOO_SMALL = 2
+    STALLED = 3
+    NON_FINITE = 4
+
+
+def status_text(code: int) -> str:
+    """Return the sentence that explains a status code."""
+    return {
+        Status.RUNNING: "still running",
+        Status.CONVERGED: "converged",
+        Status.MAX_ITER: "iteration limit reached",
+        Status.RADIUS_TOO_SMALL: "trust region shrank to nothing",
+        Status.STALLED: "no step reduces |f| any further",
+        Status.NON_FINITE: "not finite at the starting point",
+    }[Status(code)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DoglegOptions:
+    """How to search.
+
+    Parameters
+    ----------
+    ftol : float, optional
+        A row has converged when `max_i |f_i| <= ftol`. Default: 1e-11, in float32 1e-5.
+    max_iter : int
+        Largest number of trial steps of a row.
+    initial_radius, max_radius : float
+        Radius of the trust region at the start, and the most it may become; units of x.
+    min_radius : float, optional
+        A rejected step that leaves no more ends the search. Default: 10 eps initial_radius.
+    check_every : int
+        Steps between two looks at how many rows still run; each look waits for the device.
+    compact_below : float
+        Finished rows leave the batch when no more than this fraction of it runs. It changes
+        the speed, as does `check_every`, never the result.
+    """
+
+    ftol: float | None = None
+    max_iter: int = 50
+    initial_radius: float = 1.0
+    max_radius: float = 100.0
+    min_radius: float | None = None
+    check_every: int = 1
+    compact_below: float = 0.75
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that mean nothing."""
+        infinity = float("inf")
+        for name, low, high in (
+            ("ftol", 0, infinity),
+            ("max_iter", 0, infinity),
+            ("initial_radius", 0, infinity),
+            ("max_radius", self.initial_radius, infinity),
+            ("min_radius", 0, self.initial_radius),
+            ("check_every", 1, infinity),
+            ("compact_below", 0, 1),
+        ):
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:  # which NaN is not
+                raise RangeError(name, value, low, None if high == infinity else high)
+            if name in ("max_iter", "check_every") and not isinstance(value, int):
+                raise FdntValueError(f"{name} must be an integer, not {value!r}")
+        if self.initial_radius == 0 or self.max_radius == infinity:
+            raise FdntValueError("initial_radius must be positive and max_radius finite")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RootResult:
+    """Roots of a batch of systems, in the order of the starting points.
+
+    All arrays share the library and device of `x0`, those of floats its dtype. A row that
+    failed holds the best point it reached; what becomes of it is the caller's choice.
+
+    Parameters
+    ----------
+    x : array, shape (n, d)
+        The last point accepted; for NON_FINITE the starting point.
+    f, jac : array, shapes (n, d) and (n, d, d)
+        The equations and their Jacobian there.
+    radius : array, shape (n,)
+        Radius of the trust region at the end.
+    status : array, shape (n,), int32
+        A `Status`.
+    n_iter, n_eval : array, shape (n,), int32
+        Trial steps, accepted or not; evaluations, that of the starting point included.
+    """
+
+    x: Array
+    f: Array
+    jac: Array
+    radius: Array
+    status: Array
+    n_iter: Array
+    n_eval: Array
+
+    @property
+    def success(self) -> Array:
+        """True where a root was found, shape (n,), bool."""
+        return self.status == int(Status.CONVERGED)
+
+    def take(self, rows: Array) -> Self:
+        """Return the given rows (integer array), in that order."""
+        xp = array_namespace(x=self.x, rows=rows)
+        columns = {g.name: xp.take(getattr(self, g.name), rows, axis=0) for g in fields(self)}
+        return type(self)(**columns)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _State(RootResult):
+    index: Array  # the place of the row in the batch of the caller
+
+
+_DEFAULTS: Final = DoglegOptions()
+
+
+def find_root(problem: RootProblem, x0: Array, *, options: DoglegOptions = _DEFAULTS) -> RootResult:
+    """Find a root of each row's equations by Powell's dogleg.
+
+    The Newton step is taken where it fits the trust region, else a step along the path
+    from the minimum of the linear model on the gradient (the Cauchy step) to Newton's.
+
+    Parameters
+    ----------
+    problem : RootProblem
+        The equations. It is asked to `take` ever fewer of its rows as others finish.
+    x0 : array, shape (n, d), real floating
+        Starting points, `1 <= d <= 6`; n may be 0.
+    options : DoglegOptions
+        Tolerances, radii, limits.
+
+    Returns
+    -------
+    RootResult
+        Row i belongs to row i of `x0`.
+
+    Raises
+    ------
+    RangeError, ShapeMismatchError, NamespaceError
+        If `x0` has not the shape above, or `evaluate` changes shape, library, dtype, device.
+
+    Notes
+    -----
+    The status of a row is the first of these that holds:
+
+    1. NON_FINITE: `f` or the Jacobian is not finite at the starting point.
+    2. CONVERGED: `max_i |f_i| <= ftol`; or 3 or 4 holds and `max_i |f_i| <= 100 ftol`,
+       the row being as near to the root as the rounding of its `f` allows.
+    3. RADIUS_TOO_SMALL: a step was rejected and left a radius `<= min_radius`.
+    4. STALLED: the step is `|p_i| <= eps |x_i|` for all i, or promises to reduce `|f|²` by
+       no more than `4 eps |f|²`, as in a local minimum.
+    5. MAX_ITER: `max_iter` steps were tried.
+
+    `|f|` never grows from one accepted point to the next. A step costs one evaluation; the
+    host looks at the device once in `check_every` steps.
+
+    References
+    ----------
+    .. [1] Nocedal and Wright 2006, Numerical Optimization, 2nd ed., chapters 4 and 11.
+    """
+    x0 = as_floating(xp := array_namespace(x0=x0), x0, "x0")
+    eps, ftol, least = float(xp.finfo(x0.dtype).eps), options.ftol, options.min_radius
+    ftol = (1e-11 if eps < 1e-12 else 1e-5) if ftol is None else ftol
+    least = 10.0 * eps * options.initial_radius if least is None else least
+    state = _start(xp, problem, x0, options.initial_radius, ftol)
+    finished: list[_State] = []
+    for i in range(options.max_iter):
+        if i % options.check_every == 0:
+            done = xp.astype(state.status != int(Status.RUNNING), xp.int32)
+            n = done.shape[0]
+            n_running = n - int(xp.sum(done))
+            if n_running == 0:
+                break
+            if n_running < n and n_running <= options.compact_below * n:
+                order = xp.argsort(done, stable=True)
+                finished.append(state.take(order[n_running:]))
+                state, problem = state.take(order[:n_running]), problem.take(order[:n_running])
+        state = _step(xp, problem, state, (ftol, least, options.max_radius))
+    return _collect(xp, [*finished, state])
+
+
+def _start(xp: ModuleType, problem: RootProblem, x: Array, radius: float, ftol: float) -> _State:
+    if x.ndim != 2:
+        raise ShapeMismatchError(f"x0 must have shape (n, d), not {tuple(x.shape)}")
+    if not 1 <= x.shape[1] <= _MAX_UNKNOWNS:
+        raise RangeError("number of unknowns", x.shape[1], 1, _MAX_UNKNOWNS)
+    f, jac, finite = _evaluate(xp, problem, x)
+    radii = xp.full_like(x[:, 0], radius)
+    none = xp.zeros_like(radii, dtype=xp.int32)
+    index = xp.arange(x.shape[0], dtype=xp.int64, device=device_of(x))
+    status = xp.full_like(none, int(Status.RUNNING))
+    status = _mark(xp, status, _size(xp, f) <= ftol, Status.CONVERGED)
+    status = _mark(xp, status, ~finite, Status.NON_FINITE)
+    return _State(
+        x=x, f=f, jac=jac, radius=radii, status=status, n_iter=none, n_eval=none + 1, index=index
+    )
+
+
+def _step(
+    xp: ModuleType, problem: RootProblem, state: _State, limits: tuple[float, float, float]
+) -> _State:
+    """Try one step of every running row; leave the others as they are."""
+    (ftol, min_radius, max_radius), eps = limits, float(xp.finfo(state.x.dtype).eps)
+    running = state.status == int(Status.RUNNING)
+    # Rows at rest solve 1 p = 0: harmless arithmetic, and p = 0.
+    f = xp.where(running[:, None], state.f, xp.zeros_like(state.f))
+    unit = xp.eye(f.shape[1], dtype=f.dtype, device=device_of(f))[None, :, :]
+    jac = xp.where(running[:, None, None], state.jac, unit)
+    radius = xp.where(running, state.radius, xp.ones_like(state.radius))
+    step = _dogleg_step(xp, f, jac, radius)
+    f_trial, jac_trial, inside = _evaluate(xp, problem, state.x + step)
+
+    promised = _reduction(xp, f, f + _add_up(xp, jac * step[:, None, :]))
+    real = _reduction(xp, f, xp.where(inside[:, None], f_trial, f))
+    # Written without a division: the promise may be 0.
+    accept = running & inside & (promised > 0.0) & (real >= _ACCEPT * promised)
+    f = xp.where(accept[:, None], f_trial, state.f)
+    length = _norm(xp, step)
+    grows = (real > _GROW_ABOVE * promised) & (length >= _AT_BOUNDARY * radius)
+    grown = xp.minimum(_GROW * radius, xp.full_like(radius, max_radius))
+    radius = xp.where(grows, grown, radius)
+    radius = xp.where(real < _SHRINK_BELOW * promised, _SHRINK * length, radius)
+    radius = xp.where(inside, radius, _SHRINK_OUTSIDE * length)
+    still = xp.all(xp.abs(step) <= eps * xp.abs(state.x), axis=-1)
+    stalled = inside & (still | (promised <= _FLAT * eps))
+    too_small = ~accept & (radius <= min_radius)
+    size = _size(xp, f)
+    rounding = (stalled | too_small) & (size <= _ROUNDING * ftol)
+    # The later mark decides over the earlier.
+    status = _mark(xp, state.status, stalled, Status.STALLED)
+    status = _mark(xp, status, too_small, Status.RADIUS_TOO_SMALL)
+    status = _mark(xp, status, rounding | (size <= ftol), Status.CONVERGED)
+    return _State(
+        x=xp.where(accept[:, None], state.x + step, state.x),
+        f=f,
+        jac=xp.where(accept[:, None, None], jac_trial, state.jac),
+        radius=xp.where(running, radius, state.radius),
+        status=xp.where(running, status, state.status),
+        n_iter=state.n_iter + xp.astype(running, xp.int32),
+        n_eval=state.n_eval + xp.astype(running, xp.int32),
+        index=state.index,
+    )
+
+
+def _dogleg_step(xp: ModuleType, f: Array, jac: Array, radius: Array) -> Array:
+    """Return the step of length `<= radius` along the path 0 - Cauchy - Newton."""
+    newton, solved = newton_step(xp, f, jac)
+    cauchy = _cauchy_step(xp, f, jac, radius)
+    # |cauchy + s u| = radius, u the direction from Cauchy to Newton; in units of the radius.
+    distance = _norm(xp, newton - cauchy)
+    unit = (newton - cauchy) / _safe(xp, distance)[:, None]
+    start = cauchy / radius[:, None]
+    along = _add_up(xp, start * unit)
+    gap = xp.abs(1.0 - _add_up(xp, start * start))  # never below 0 but by rounding
+    root = xp.sqrt(along * along + gap)
+    # The form of the positive root that does not cancel.
+    s = xp.where(along > 0.0, gap / _safe(xp, xp.abs(along) + root), root - along)
+    s = xp.minimum(s * radius, distance)
+    bent = xp.where(solved[:, None], cauchy + s[:, None] * unit, cauchy)
+    return xp.where((solved & (_norm(xp, newton) <= radius))[:, None], newton, bent)
+
+
+def _cauchy_step(xp: ModuleType, f: Array, jac: Array, radius: Array) -> Array:
+    """Return the minimum of `|f + J p|` along `-Jᵀ f`, cut at the radius."""
+    # p = -(|g|/|J u|²) u, g = Jᵀ f, u = g/|g|; f and J scaled, lest squares over- or underflow.
+    size_f = _safe(xp, _size(xp, f))
+    size_j = _scale(xp, xp.max(_size(xp, jac), axis=-1), size_f)
+    jac = jac / size_j[:, None, None]
+    gradient = _add_up(xp, jac * (f / size_f[:, None])[:, :, None], axis=1)
+    slope = _norm(xp, gradient)
+    unit = gradient / _safe(xp, slope)[:, None]
+    rate = _safe(xp, _norm(xp, _add_up(xp, jac * unit[:, None, :])))
+    length = xp.minimum(slope / rate / rate * (size_f / size_j), radius)
+    return -length[:, None] * unit
+
+
+def newton_step(xp: ModuleType, f: Array, jac: Array) -> tuple[Array, Array]:
+    """Solve `J p = -f`; return p, and where J is regular; elsewhere p = 0.
+
+    Gauss-Jordan elimination, rows scaled by their largest element, pivots from unused rows.
+    Not `linalg.solve`: there one singular matrix raises for the batch (numpy, torch) or the
+    host waits (CUDA), the kernel depends on the size of the batch, and a determinant to
+    screen by would be a second factorisation.
+    """
+    tiny = _SINGULAR * float(xp.finfo(f.dtype).eps)
+    place = xp.arange(f.shape[1], dtype=xp.int64, device=device_of(f))[None, :]
+    scale = _scale(xp, _size(xp, jac), _size(xp, f)[:, None])
+    work = xp.concat([jac, -f[..., None]], axis=-1) / scale[..., None]
+    unused, columns = xp.ones_like(f, dtype=xp.bool), []
+    regular = xp.all(unused, axis=-1)
+    for k in range(f.shape[1]):
+        column = work[..., k]
+        candidates = xp.where(unused, xp.abs(column), -xp.ones_like(column))
+        here = place == xp.argmax(candidates, axis=-1, keepdims=True)
+        # A sum of which one term is not 0 is a selection, and exact.
+        row = xp.sum(xp.where(here[..., None], work, xp.zeros_like(work)), axis=1)
+        fair = xp.max(candidates, axis=-1) > tiny
+        row = row / xp.where(fair, row[:, k], xp.ones_like(row[:, k]))[:, None]
+        rest = work - column[..., None] * row[:, None, :]
+        work = xp.where(here[..., None], row[:, None, :], rest)
+        unused, regular = unused & ~here, regular & fair
+        columns.append(here)
+    answer, zero = work[..., -1], xp.zeros_like(f)
+    step = xp.stack([xp.sum(xp.where(h, answer, zero), axis=-1) for h in columns], axis=-1)
+    regular = regular & xp.all(xp.isfinite(step), axis=-1)
+    return xp.where(regular[:, None], step, zero), regular
+
+
+def _collect(xp: ModuleType, parts: list[_State]) -> RootResult:
+    """Join the rows that finished at different times, in the order of the caller."""
+    order = xp.argsort(xp.concat([part.index for part in parts], axis=0))
+    names = [field.name for field in fields(RootResult)]
+    columns = {g: xp.concat([getattr(part, g) for part in parts], axis=0) for g in names}
+    result = RootResult(**columns).take(order)
+    running = result.status == int(Status.RUNNING)
+    return replace(result, status=_mark(xp, result.status, running, Status.MAX_ITER))
+
+
+def _evaluate(xp: ModuleType, problem: RootProblem, x: Array) -> tuple[Array, Array, Array]:
+    """Return f, its Jacobian, and where both are finite; hold the problem to its contract."""
+    f, jac = problem.evaluate(x)
+    array_namespace(x0=x, f=f, jac=jac)
+    require_dtype(x.dtype, f=f, jac=jac)
+    n, d = x.shape
+    shapes, expected = (tuple(f.shape), tuple(jac.shape)), ((n, d), (n, d, d))
+    if shapes != expected:
+        raise ShapeMismatchError(f"problem.evaluate returned {shapes}, expected {expected}")
+    return f, jac, xp.all(xp.isfinite(f), axis=-1) & xp.all(xp.isfinite(jac), axis=(-2, -1))
+
+
+def _reduction(xp: ModuleType, f: Array, new: Array) -> Array:
+    """Return `1 - |new|²/|f|²`, cut at -3, where the ratio is still far from overflow."""
+    size = _norm(xp, f)
+    ratio = xp.minimum(_norm(xp, new), 2.0 * size) / _safe(xp, size)
+    return 1.0 - ratio * ratio
+
+
+def _mark(xp: ModuleType, status: Array, rows: Array, code: Status) -> Array:
+    return xp.where(rows, xp.full_like(status, int(code)), status)
+
+
+def _safe(xp: ModuleType, denominator: Array) -> Array:
+    return xp.where(denominator == 0.0, xp.ones_like(denominator), denominator)
+
+
+def _scale(xp: ModuleType, size: Array, size_f: Array) -> Array:
+    """Return the size of J, infinite (J is 0) where `|f|/|J|` is absurd and might overflow."""
+    sane = size > float(xp.finfo(size.dtype).eps) ** 4 * size_f
+    return xp.where(sane, size, xp.full_like(size, float("inf")))
+
+
+def _size(xp: ModuleType, array: Array) -> Array:
+    return xp.max(xp.abs(array), axis=-1)
+
+
+def _norm(xp: ModuleType, vector: Array) -> Array:
+    size = _size(xp, vector)
+    scaled = vector / _safe(xp, size)[:, None]
+    return size * xp.sqrt(_add_up(xp, scaled * scaled))
+
+
+def _add_up(xp: ModuleType, terms: Array, axis: int = -1) -> Array:
+    """Add from left to right: `sum` and `matmul` let layout and batch choose the order."""
+    return reduce(add, xp.unstack(terms, axis=axis))

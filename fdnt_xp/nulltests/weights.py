@@ -1,0 +1,182 @@
+"""The weight of the null tests, and the equation that sets its size.
+
+In the frame where the galaxy is round, with `q = |k'|²` and `s = exp(|eta|/2)`,
+
+    W(q) = 𝒯(s sqrt(q)) exp(-q sigma²/2),
+
+B10 eq. (20) with the shrink factor of its §4.2. Because `s|k'| >= |k|`, the weight never
+reaches a k outside the disc where the PSF has left information.
+
+The size equation (B10 eq. 35 in the scale-free form of docs, "Size of the weight") matches
+the mean square wave number of the weight to that of the galaxy, both under 𝒯. With
+`u = s|k'|` it is a relation between two numbers, the same for every galaxy of one PSF: it
+is inverted once, in a table.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from fdnt_xp.arrays import Array, array_namespace, device_of
+from fdnt_xp.fourier.interpolation import CubicTable, cubic_table
+from fdnt_xp.fourier.psf import Psf
+
+_QUADRATURE: Final = 96
+"""Gauss-Legendre nodes of the integrals over k in the size equation."""
+_WIDTH_NODES: Final = 129
+_NEWTON_STEPS: Final = 8
+"""1/<k²> is nearly linear in sigma² (exactly so for a Gaussian 𝒯): Newton needs few steps."""
+_NARROWEST: Final = 0.5
+"""Least `sigma kmax`: the Gaussian is then above 0.88 all over the disc and does no more."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Weight:
+    """The weight for one PSF, or for one PSF per galaxy.
+
+    Widths are squares of sizes, `width = sigma²`, in pixel²: the size equation is nearly
+    linear in them, and regular where the galaxy is too small to have a size.
+
+    Parameters
+    ----------
+    psf_part : CubicTable
+        `𝒯` as a function of `k/kmax`.
+    kmax : array, shape (n_psf,)
+        Where `𝒯` ends, rad/pixel.
+    width_part : CubicTable
+        `kmax² sigma²` over the table's range, as a function of where `kmax²/<k²>` is in its
+        range (both mapped to [0, 1]), for s = 1.
+    width_range, square_range : array, shape (n_psf, 2)
+        The ranges of `kmax² sigma²` and `kmax²/<k²>`.
+    """
+
+    psf_part: CubicTable
+    kmax: Array
+    width_part: CubicTable
+    width_range: Array
+    square_range: Array
+
+    def take(self, rows: Array) -> Weight:
+        """Return the weights of the given galaxies; a shared one stays as it is."""
+        xp = array_namespace(kmax=self.kmax)
+        if self.shared:
+            return self
+        return Weight(
+            psf_part=self.psf_part.take(rows),
+            kmax=xp.take(self.kmax, rows, axis=0),
+            width_part=self.width_part.take(rows),
+            width_range=xp.take(self.width_range, rows, axis=0),
+            square_range=xp.take(self.square_range, rows, axis=0),
+        )
+
+    @property
+    def shared(self) -> bool:
+        """Whether one weight serves all galaxies."""
+        return int(self.kmax.shape[0]) == 1
+
+    def psf_factor(self, square: Array, shrink: Array) -> tuple[Array, Array]:
+        """Return `𝒯(s sqrt(q))` and its derivative by q.
+
+        Parameters
+        ----------
+        square : array, shape (n_gal, n_k)
+            `q = |k'|²`.
+        shrink : array, shape (n_gal,)
+            s.
+        """
+        xp = array_namespace(square=square)
+        scale = shrink / self.kmax
+        t = xp.sqrt(square) * scale[:, None]
+        row = self._rows(int(square.shape[0]))
+        value, slope = self.psf_part.evaluate(t, row)
+        # dt/dq = scale²/2t. At k = 0 the derivative only ever meets factors of q.
+        at_zero = t == 0
+        safe = xp.where(at_zero, xp.ones_like(t), t)
+        by_square = xp.where(at_zero, xp.zeros_like(t), slope / safe)
+        return value, by_square * (0.5 * scale**2)[:, None]
+
+    def matched_width(self, inverse_square: Array, shrink: Array) -> tuple[Array, Array, Array]:
+        """Solve the size equation: the weight whose mean square wave number is the galaxy's.
+
+        Parameters
+        ----------
+        inverse_square : array, shape (n_gal,)
+            `1/<|k'|²>` of the galaxy under 𝒯; not NaN.
+        shrink : array, shape (n_gal,)
+            s.
+
+        Returns
+        -------
+        width : array, shape (n_gal,)
+            sigma², held inside the range of sizes.
+        slope : array, shape (n_gal,)
+            d(sigma²)/d(1/<|k'|²>); zero at the bounds.
+        at_bound : array, shape (n_gal,), bool
+            Where the equation asks for a width beyond the range.
+        """
+        xp = array_namespace(inverse_square=inverse_square)
+        # In units where the disc of the sheared weight has radius 1: k = s|k'|/kmax.
+        unit = (self.kmax / shrink) ** 2
+        low, high = self.square_range[:, 0], self.square_range[:, 1]
+        position = (inverse_square * unit - low) / (high - low)
+        at_bound = (position <= 0) | (position >= 1)
+        inside = xp.minimum(xp.maximum(position, xp.zeros_like(unit)), xp.ones_like(unit))
+        value, slope = self.width_part.evaluate(inside, self._rows(int(unit.shape[0])))
+        narrow, wide = self.width_range[:, 0], self.width_range[:, 1]
+        width = (narrow + value * (wide - narrow)) / unit
+        slope = slope * (wide - narrow) / (high - low)
+        return width, xp.where(at_bound, xp.zeros_like(slope), slope), at_bound
+
+    def _rows(self, n_gal: int) -> Array | None:
+        """Return which table each galaxy uses, or None for the only one."""
+        if self.shared:
+            return None
+        xp = array_namespace(kmax=self.kmax)
+        return xp.arange(n_gal, dtype=xp.int64, device=device_of(self.kmax))
+
+
+def make_weight(psf: Psf, largest_size: float) -> Weight:
+    """Tabulate the weight of each PSF, for sizes up to `largest_size` pixels."""
+    xp = array_namespace(kmax=psf.kmax)
+    like = {"dtype": psf.kmax.dtype, "device": device_of(psf.kmax)}
+    nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE)
+    t = xp.asarray(0.5 * (nodes + 1.0), **like)
+    row = xp.arange(psf.n_psf, dtype=xp.int64, device=device_of(psf.kmax))
+    grid = xp.broadcast_to(t[None, :], (psf.n_psf, _QUADRATURE))
+    measure = psf.weight.evaluate(grid, row)[0] * (t * xp.asarray(weights, **like))[None, :]
+
+    narrow = xp.full_like(psf.kmax, _NARROWEST**2)
+    wide = xp.maximum((largest_size * psf.kmax) ** 2, 4.0 * narrow)
+    ends = xp.stack([narrow, wide], axis=-1)
+    square_ends, _ = _inverse_mean_square(measure, t, ends)
+    fraction = xp.linspace(0.0, 1.0, _WIDTH_NODES, **like)[None, :]
+    low, high = square_ends[:, 0:1], square_ends[:, 1:2]
+    wanted = low + fraction * (high - low)
+    width = ends[:, 0:1] + fraction * (ends[:, 1:2] - ends[:, 0:1])
+    for _ in range(_NEWTON_STEPS):
+        square, slope = _inverse_mean_square(measure, t, width)
+        width = xp.maximum(width + (wanted - square) / slope, xp.zeros_like(width))
+    relative = (width - ends[:, 0:1]) / (ends[:, 1:2] - ends[:, 0:1])
+    return Weight(
+        psf_part=psf.weight,
+        kmax=psf.kmax,
+        width_part=cubic_table(relative),
+        width_range=ends,
+        square_range=square_ends,
+    )
+
+
+def _inverse_mean_square(measure: Array, t: Array, width: Array) -> tuple[Array, Array]:
+    """Return `1/<t²>` under `𝒯(t) exp(-t² width/2) t dt` and its derivative by the width.
+
+    `measure` (n_psf, n_t) holds `𝒯 t dt`; `width` and the results are (n_psf, n_width).
+    """
+    xp = array_namespace(t=t)
+    square = t**2
+    gauss = measure[:, None, :] * xp.exp(-0.5 * width[:, :, None] * square)
+    m0, m2, m4 = (xp.sum(gauss * f, axis=-1) for f in (xp.ones_like(square), square, square**2))
+    # d<t²>/dwidth = -Var(t²)/2.
+    return m0 / m2, 0.5 * (m4 * m0 - m2**2) / m2**2

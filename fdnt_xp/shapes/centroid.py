@@ -1,0 +1,80 @@
+"""Where to start: the centroid of each galaxy under a wide round weight.
+
+The null tests have many roots far from the galaxy; a start that is centred finds the
+right one. Under a fixed round weight the dipole alone is solved, from the stamp's centre.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from fdnt_xp.arrays import Array, array_namespace
+from fdnt_xp.fourier.grid import KGrid
+from fdnt_xp.fourier.transform import DeconvolvedStamps
+from fdnt_xp.nulltests.dogleg import DoglegOptions, find_root
+
+
+@dataclass(frozen=True, kw_only=True)
+class DipoleTests:
+    """The dipole of each galaxy under a fixed weight: a `RootProblem` in `(x0/L, y0/L)`.
+
+    Parameters
+    ----------
+    grid : KGrid
+    galaxies : DeconvolvedStamps
+    weight : array, shape (n_gal or 1, n_k)
+        W on the modes of the grid.
+    length : float
+        L, pixels.
+    """
+
+    grid: KGrid
+    galaxies: DeconvolvedStamps
+    weight: Array
+    length: float
+
+    def take(self, rows: Array) -> DipoleTests:
+        """Return the problem of the given galaxies (integer array)."""
+        xp = array_namespace(rows=rows)
+        shared = int(self.weight.shape[0]) == 1
+        return DipoleTests(
+            grid=self.grid,
+            galaxies=self.galaxies.take(rows),
+            weight=self.weight if shared else xp.take(self.weight, rows, axis=0),
+            length=self.length,
+        )
+
+    def evaluate(self, x: Array) -> tuple[Array, Array]:
+        """Return `sum W Im I~ k / (L sum W Re I~ |k|²)` and its Jacobian by x0/L.
+
+        NaN where the denominator is not positive: there the weight sees no galaxy.
+        """
+        xp = array_namespace(x=x)
+        re, im = self.galaxies.shifted(self.grid, self.length * x)
+        _, even, _ = self.grid.even_moments(self.weight * re)
+        odd, cubic = self.grid.odd_moments(self.weight * im)
+        scale = self.length * (even[:, 0:1] + even[:, 2:3])
+        nan = xp.full_like(scale, float("nan"))
+        inverse = xp.where(scale > 0, 1.0 / xp.where(scale > 0, scale, xp.ones_like(scale)), nan)
+        f = odd * inverse
+        # d Im/dx0 = kx Re, and d(scale)/dx0 = -L sum W Im k |k|².
+        slope = xp.stack([even[:, 0:2], even[:, 1:3]], axis=1)
+        scale_slope = -self.length * (cubic[:, 0:2] + cubic[:, 2:4])
+        jac = slope - f[:, :, None] * scale_slope[:, None, :]
+        return f, self.length * jac * inverse[:, :, None]
+
+
+def starting_centroid(
+    grid: KGrid, galaxies: DeconvolvedStamps, weight: Array, length: float, *, reach: float
+) -> Array:
+    """Return a first centroid, pixels from the centre of the stamp; shape (n_gal, 2).
+
+    Where no centroid is found within `reach` pixels, the centre of the stamp.
+    """
+    xp = array_namespace(weight=weight)
+    problem = DipoleTests(grid=grid, galaxies=galaxies, weight=weight, length=length)
+    centre = xp.zeros_like(galaxies.re[:, :2])
+    options = DoglegOptions(ftol=1e-3, max_iter=12, initial_radius=2.0, max_radius=8.0)
+    found = length * find_root(problem, centre, options=options).x
+    near = xp.abs(found) <= reach
+    return xp.where((near[:, 0] & near[:, 1])[:, None], found, centre)
