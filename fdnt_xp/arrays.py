@@ -95,6 +95,11 @@ def device_of(array: Array) -> Device:
     return array_api_compat.device(array)
 
 
+def compiles_every_shape(xp: ModuleType) -> bool:
+    """Return whether each operation is compiled anew for each shape of its arguments (JAX)."""
+    return _library(xp) == "jax"
+
+
 def to_numpy(array: Array) -> np.ndarray[Any, Any]:
     """Copy an array to the host. For results and reports, never inside a kernel."""
     if array_api_compat.is_torch_array(array):

@@ -15,6 +15,8 @@ from typing import Final
 class Flag(IntFlag):
     """Why a galaxy was not measured, or what to know about its measurement."""
 
+    EDGE = 1 << 0
+    """The stamp around the position is cut by the edge of the image."""
     CENTROID_OFF_STAMP = 1 << 3
     """The centroid left the stamp: there is no such galaxy here."""
     SIZE_AT_BOUND = 1 << 4
@@ -41,6 +43,8 @@ class Flag(IntFlag):
     """The null tests became NaN or infinite during the solution."""
     FINE_GRID = 1 << 19
     """Measured on the zero-padded k grid, because the galaxy is very elongated."""
+    OFF_IMAGE = 1 << 20
+    """The position that was given is not on the image, or not a number."""
 
 
 INFORMATION: Final = Flag.SIZE_AT_BOUND | Flag.SIZE_FIXED | Flag.FINE_GRID
@@ -68,6 +72,7 @@ def flag_text(name: str) -> str:
 
 
 _TEXT: Final[dict[str, str]] = {
+    "EDGE": "stamp cut by the edge of the image",
     "CENTROID_OFF_STAMP": "centroid outside the stamp",
     "SIZE_AT_BOUND": "weight size held at its bound",
     "SIZE_FIXED": "weight size given by the caller",
@@ -81,4 +86,5 @@ _TEXT: Final[dict[str, str]] = {
     "BAD_PSF": "unusable PSF",
     "NON_FINITE_RESULT": "null tests not finite",
     "FINE_GRID": "measured on the zero-padded k grid",
+    "OFF_IMAGE": "position not on the image",
 }

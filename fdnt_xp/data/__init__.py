@@ -1,1 +1,1 @@
-"""What comes in and goes out: images, catalogs, simulations."""
+"""What comes in and goes out: images, stamps, catalogs, simulated fields."""

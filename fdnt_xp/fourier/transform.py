@@ -37,11 +37,11 @@ class DeconvolvedStamps:
         Parameters
         ----------
         centroid : array, shape (n_gal, 2)
-            x0 in pixels from the origin.
+            x0 in pixels of the stamp from the origin.
         """
         xp = array_namespace(re=self.re)
-        angle = centroid[:, 0:1] * grid.kx[None, :] + centroid[:, 1:2] * grid.ky[None, :]
-        cos, sin = xp.cos(angle), xp.sin(angle)
+        phase = mode_phase(grid, centroid)
+        cos, sin = xp.real(phase), xp.imag(phase)
         return cos * self.re - sin * self.im, sin * self.re + cos * self.im
 
 
@@ -83,8 +83,9 @@ def half_plane_axes(grid: KGrid) -> tuple[Array, Array]:
 def mode_phase(grid: KGrid, position: Array) -> Array:
     """Return `exp(+i k.x)` on the modes of the data, shape (n, n_k), complex.
 
-    Uses the modes named by `grid.index`, not `grid.kx`: a counter-sheared grid has other
-    coordinates for the same data.
+    The exponential of a sum is a product of two that are made along one axis each, which
+    halves the time. Uses the modes named by `grid.index`, not `grid.kx`: a counter-sheared
+    grid has other coordinates for the same data.
 
     Parameters
     ----------

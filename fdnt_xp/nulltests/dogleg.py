@@ -308,9 +308,8 @@ def _dogleg_step(xp: ModuleType, f: Array, jac: Array, radius: Array) -> Array:
     along = _add_up(xp, start * unit)
     gap = xp.abs(1.0 - _add_up(xp, start * start))  # never below 0 but by rounding
     root = xp.sqrt(along * along + gap)
-    # The form of the positive root that does not cancel.
-    s = xp.where(along > 0.0, gap / _safe(xp, xp.abs(along) + root), root - along)
-    s = xp.minimum(s * radius, distance)
+    # The form of the positive root that does not cancel; along < 0 is rounding.
+    s = xp.minimum(gap / _safe(xp, xp.abs(along) + root) * radius, distance)
     bent = xp.where(solved[:, None], cauchy + s[:, None] * unit, cauchy)
     return xp.where((solved & (_norm(xp, newton) <= radius))[:, None], newton, bent)
 

@@ -18,6 +18,7 @@ from fdnt_xp.arrays import (
     Array,
     array_namespace,
     as_floating,
+    compiles_every_shape,
     device_of,
     require_dtype,
 )
@@ -271,7 +272,13 @@ def _solve(job: _Job, tests: NullTests, side: int) -> RootResult:
     wide = psf_factor * xp.exp(-0.5 * (_WIDE * side) ** 2 * square)
     centre = starting_centroid(grid, tests.galaxies, wide, job.length, reach=0.5 * side)
     start = xp.concat([xp.zeros_like(centre), centre / job.length], axis=-1)
-    options = DoglegOptions(max_iter=job.max_iter, initial_radius=1.0, max_radius=3.0)
+    options = DoglegOptions(
+        max_iter=job.max_iter,
+        initial_radius=1.0,
+        max_radius=3.0,
+        # Taking finished rows out makes ever new shapes.
+        compact_below=0.0 if compiles_every_shape(xp) else 0.75,
+    )
     return find_root(tests, start, options=options)
 
 
