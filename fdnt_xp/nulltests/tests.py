@@ -87,22 +87,20 @@ class TestNoise:
     ----------
     even, odd : array, shape (n_gal, 2, 2)
         Covariances of (t1, t2), the noise of a free width included, and of (tx, ty).
-    scale : array, shape (n_gal,)
-        t0.
     flux, flux_variance : array, shape (n_gal,)
         Amplitude F of the Gaussian galaxy `F exp(-q sigma²/2)` that has the same sum under
         the weight.
-    matched : MatchedWidth
-        The width of the weight.
+    tests, matched : TestValues, MatchedWidth
+        The raw tests and the width of the weight.
     """
 
     __test__ = False
 
     even: Array
     odd: Array
-    scale: Array
     flux: Array
     flux_variance: Array
+    tests: TestValues
     matched: MatchedWidth
 
 
@@ -212,9 +210,9 @@ class NullTests:
         return TestNoise(
             even=_symmetric(even),
             odd=_symmetric(ww2),
-            scale=tests.values[:, 4],
             flux=self.grid.even_moments(weight * view.re)[0][:, 0] / sum_gauss,
             flux_variance=ww0[:, 0] / sum_gauss**2,
+            tests=tests,
             matched=matched,
         )
 

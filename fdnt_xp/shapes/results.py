@@ -29,6 +29,8 @@ class ShapeResult:
         Conformal shear of the galaxy before the PSF: `a/b = exp(|eta|)`.
     eta_cov : array, shape (n_gal, 2, 2)
         Covariance of `eta` from the pixel noise; NaN if no noise variance was given.
+    eg : array, shape (n_gal,)
+        Ellipticity gradient EG: the shape responds to shear by `1/(1 - EG)` along its axis.
     centroid : array, shape (n_gal, 2)
         (x, y) in pixels of the stamp, 0-based, integer at pixel centres.
     size : array, shape (n_gal,)
@@ -48,6 +50,7 @@ class ShapeResult:
 
     eta: Array
     eta_cov: Array
+    eg: Array
     centroid: Array
     size: Array
     flux: Array
@@ -72,6 +75,7 @@ class ShapeResult:
         return cls(
             eta=nan(2),
             eta_cov=nan(2, 2),
+            eg=nan(),
             centroid=nan(2),
             size=nan(),
             flux=nan(),
@@ -142,6 +146,7 @@ class ShapeResult:
             "e2": host.e[:, 1],
             "g1": host.g[:, 0],
             "g2": host.g[:, 1],
+            "eg": host.eg,
             "size": host.size,
             "flux": host.flux,
             "snr": host.snr,
@@ -168,6 +173,7 @@ COLUMNS: dict[str, tuple[str | None, str]] = {
     "e2": (None, "distortion, component 2"),
     "g1": (None, "reduced shear (a-b)/(a+b), component 1"),
     "g2": (None, "reduced shear, component 2"),
+    "eg": (None, "ellipticity gradient: response to shear along the axis is 1/(1 - eg)"),
     "size": ("pix", "sigma of the Gaussian factor of the weight"),
     "flux": (None, "flux of the matched Gaussian galaxy, in units of the image"),
     "snr": (None, "flux over its error"),

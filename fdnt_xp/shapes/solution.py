@@ -7,6 +7,7 @@ from typing import Final
 from fdnt_xp.arrays import Array, array_namespace, device_of
 from fdnt_xp.flags import FAILED, Flag
 from fdnt_xp.nulltests.dogleg import RootResult, Status, newton_step
+from fdnt_xp.nulltests.gradient import ellipticity_gradient
 from fdnt_xp.nulltests.tests import NullTests, TestNoise
 from fdnt_xp.shapes.results import ShapeResult
 
@@ -83,6 +84,7 @@ def describe(
 
     return ShapeResult(
         eta=where_measured(eta),
+        eg=where_measured(ellipticity_gradient(eta, noise.tests, noise.matched, tests.length)),
         eta_cov=where_measured(eta_cov * noise_per_mode[:, None, None]),
         centroid=where_measured(centroid + xp.stack(middle, axis=-1)),
         size=where_measured(xp.sqrt(noise.matched.width)),
@@ -110,7 +112,8 @@ def _eta_covariance(tests: NullTests, root: RootResult, noise: TestNoise) -> tup
         regular = regular & solved
     # Rows 0 and 1 of J⁻¹, column by column.
     to_eta = xp.stack(inverse, axis=-1)[:, :2, :]
-    safe = xp.where(noise.scale > 0, noise.scale, xp.ones_like(noise.scale))[:, None, None]
+    scale = noise.tests.values[:, 4]
+    safe = xp.where(scale > 0, scale, xp.ones_like(scale))[:, None, None]
     even = to_eta[:, :, :2] / safe
     odd = to_eta[:, :, 2:] / (safe * tests.length)
     return _sandwich(even, noise.even) + _sandwich(odd, noise.odd), regular
