@@ -1,0 +1,270 @@
+"""The command `fdnt-xp`: measure an image, plot a catalog, see a demonstration."""
+
+from __future__ import annotations
+
+import signal
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import Any, TextIO, TypeVar
+
+import click
+
+import fdnt_xp
+from fdnt_xp.app.backends import BACKENDS, DTYPES
+from fdnt_xp.app.demo import Field, run_demo
+from fdnt_xp.app.measure import Inputs, Settings, measure_files
+from fdnt_xp.app.plots import check_figure, plot_catalog, save_figure
+from fdnt_xp.app.summary import summary_lines
+from fdnt_xp.data.catalog import check_catalog, read_catalog, write_catalog
+from fdnt_xp.errors import FdntError, FdntWarning
+
+_F = TypeVar("_F", bound=Callable[..., Any])
+_INTERRUPTED = 130
+"""Exit code of a command that Ctrl-C ended, as shells have it."""
+
+
+class _Command(click.Command):
+    """A command whose foreseen errors, warnings and interrupts are one plain line each."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command."""
+        previous = signal.signal(signal.SIGTERM, _terminate)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("always", FdntWarning)
+                warnings.showwarning = _show_warning
+                return super().invoke(ctx)
+        except FdntError as error:
+            raise click.ClickException(" ".join(str(error).split())) from error
+        except KeyboardInterrupt:
+            click.echo("Interrupted: nothing unfinished was left behind.", err=True)
+            ctx.exit(_INTERRUPTED)
+        finally:
+            signal.signal(signal.SIGTERM, previous)
+
+
+def _terminate(_number: int, _frame: FrameType | None) -> None:
+    """Let a polite kill end like Ctrl-C, so that temporary files are removed."""
+    raise KeyboardInterrupt
+
+
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,  # noqa: ARG001  the signature is Python's
+    lineno: int,  # noqa: ARG001
+    file: TextIO | None = None,  # noqa: ARG001
+    line: str | None = None,  # noqa: ARG001
+) -> None:
+    # Warnings of other libraries are about their code, not about the user's galaxies.
+    if issubclass(category, FdntWarning):
+        click.echo(f"Warning: {message}", err=True)
+
+
+def _options(*decorators: Callable[[_F], _F]) -> Callable[[_F], _F]:
+    """Return the decorators as one; the first is listed first by `--help`."""
+
+    def decorate(function: _F) -> _F:
+        for decorator in reversed(decorators):
+            function = decorator(function)
+        return function
+
+    return decorate
+
+
+_HOW = _options(
+    click.option(
+        "--backend",
+        type=click.Choice(list(BACKENDS)),
+        default="numpy",
+        show_default=True,
+        help="Array library to compute with.",
+    ),
+    click.option("--device", metavar="NAME", help="cpu, cuda, cuda:1, ... [default: its own]"),
+    click.option(
+        "--dtype",
+        type=click.Choice(DTYPES),
+        default="float64",
+        show_default=True,
+        help="Precision.",
+    ),
+    click.option(
+        "--oversampling",
+        type=click.IntRange(min=1),
+        default=1,
+        show_default=True,
+        help="PSF pixels per image pixel, along one axis.",
+    ),
+    click.option(
+        "--noise-variance",
+        type=float,
+        metavar="V",
+        help="Of one pixel. [default: measured on the borders of the stamps]",
+    ),
+    click.option(
+        "--size",
+        type=float,
+        metavar="PIXELS",
+        help="Size (sigma) of the weight. [default: solved for each galaxy]",
+    ),
+    click.option(
+        "--chunk",
+        type=click.IntRange(min=1),
+        metavar="N",
+        help="Galaxies at a time; bounds the memory. [default: 256, on a GPU 8192]",
+    ),
+    click.option("-q", "--quiet", is_flag=True, help="No progress bar and no summary."),
+)
+_OVERWRITE = click.option("--overwrite", is_flag=True, help="Replace files that exist.")
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(fdnt_xp.__version__, prog_name="fdnt-xp")
+def main() -> None:
+    """Shapes of galaxies for weak lensing, by Fourier-domain null tests."""
+
+
+@main.command(cls=_Command)
+@click.argument("image")
+@click.option("--psf", required=True, metavar="FITS", help="Image of a star, or a cube of them.")
+@click.option("--cell", type=int, metavar="N", help="The image is a grid of N x N pixel cells.")
+@click.option("--positions", metavar="TABLE", help="Positions of the galaxies on the image.")
+@click.option("--stamp-size", type=int, metavar="N", help="Pixels on a side, with --positions.")
+@click.option("--x-column", default="x", show_default=True, help="Column of --positions.")
+@click.option("--y-column", default="y", show_default=True, help="Column of --positions.")
+@click.option(
+    "--origin",
+    type=click.Choice(["0", "1"]),
+    default="0",
+    show_default=True,
+    help="Coordinate of the first pixel's centre in --positions; 1 for SExtractor.",
+)
+@click.option(
+    "-o",
+    "--output",
+    required=True,
+    metavar="CATALOG",
+    help="Catalog to write: .fits, .ecsv or .parquet.",
+)
+@_HOW
+@_OVERWRITE
+def measure(
+    image: str,
+    psf: str,
+    cell: int | None,
+    positions: str | None,
+    stamp_size: int | None,
+    x_column: str,
+    y_column: str,
+    origin: str,
+    output: str,
+    overwrite: bool,
+    **how: Any,
+) -> None:
+    """Measure the galaxies of IMAGE and write a catalog.
+
+    IMAGE is a FITS image that is a grid of cells (--cell), a FITS image with a table of
+    positions (--positions, --stamp-size), or a FITS cube of stamps. FILE.fits[EXT] names an
+    extension.
+    """
+    inputs = Inputs(
+        image=image,
+        psf=psf,
+        cell=cell,
+        positions=positions,
+        stamp_size=stamp_size,
+        x_column=x_column,
+        y_column=y_column,
+        origin=int(origin),
+    )
+    settings = Settings(**how)
+    inputs.refuse_as_output(output)
+    check_catalog(output, overwrite=overwrite)
+    table, seconds = measure_files(inputs, settings)
+    write_catalog(table, output, overwrite=overwrite)
+    if not settings.quiet:
+        for line in summary_lines(table, seconds):
+            click.echo(line)
+        click.echo(f"written    {output}")
+
+
+@main.command(cls=_Command)
+@click.argument("catalog")
+@click.option(
+    "-o", "--output", metavar="FIGURE", help=".png, .pdf or .svg. [default: CATALOG with .png]"
+)
+@_OVERWRITE
+def plot(catalog: str, output: str | None, overwrite: bool) -> None:
+    """Draw a page about CATALOG: shapes on the image, histograms, S/N, flags."""
+    target = Path(output) if output else Path(catalog).with_suffix(".png")
+    check_figure(target, overwrite=overwrite)
+    figure = plot_catalog(read_catalog(catalog), Path(catalog).name)
+    save_figure(figure, target, overwrite=overwrite)
+    click.echo(f"written    {target}")
+
+
+@main.command(cls=_Command)
+@click.option(
+    "-o",
+    "--output",
+    default="demo",
+    show_default=True,
+    metavar="FOLDER",
+    help="Where everything is written.",
+)
+@click.option("--image", metavar="FITS", help="Measure this instead of drawing one.")
+@click.option("--psf", metavar="FITS", help="Its PSF.")
+@click.option("--cell", type=int, default=64, show_default=True, help="Pixels a side of a cell.")
+@click.option("--n-side", type=int, default=40, show_default=True, help="Cells along x and y.")
+@click.option("--snr", type=float, default=200.0, show_default=True, help="Signal to noise.")
+@click.option("--noise-free", is_flag=True, help="Draw no noise.")
+@click.option(
+    "--shear",
+    type=(float, float),
+    default=(0.02, -0.01),
+    show_default=True,
+    metavar="G1 G2",
+    help="Shear to apply.",
+)
+@click.option("--random-shear", is_flag=True, help="Let the seed choose the shear.")
+@click.option("--seed", type=int, default=1, show_default=True, help="Of everything random.")
+@_HOW
+@_OVERWRITE
+def demo(
+    output: str,
+    image: str | None,
+    psf: str | None,
+    cell: int,
+    n_side: int,
+    snr: float,
+    noise_free: bool,
+    shear: tuple[float, float],
+    random_shear: bool,
+    seed: int,
+    overwrite: bool,
+    **how: Any,
+) -> None:
+    """Draw galaxies with a known shear, measure them, and compare.
+
+    The galaxies are those of the GREAT08 challenge, drawn by GalSim: exponential and de
+    Vaucouleurs profiles in pairs at 90 degrees, a truncated Moffat PSF, one shear for all.
+    """
+    if (image is None) != (psf is None):
+        raise click.UsageError("--image and --psf go together")
+    inputs = Inputs(image=image, psf=psf, cell=cell) if image and psf else None
+    field = Field(
+        side=n_side,
+        cell=cell,
+        snr=None if noise_free else snr,
+        shear=None if random_shear else shear,
+        seed=seed,
+    )
+    settings = Settings(**how)
+
+    def say(line: str) -> None:
+        if not settings.quiet:
+            click.echo(line)
+
+    run_demo(Path(output), field, inputs, settings, overwrite=overwrite, say=say)

@@ -1,0 +1,167 @@
+"""What `fdnt-xp measure` does, between its options and its last line."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fdnt_xp.app.backends import load_backend
+from fdnt_xp.app.runner import find_noise, measure_source
+from fdnt_xp.data.images import Pixels, read_image
+from fdnt_xp.data.provenance import provenance
+from fdnt_xp.data.stamps import StampSource, cube_stamps, grid_stamps, position_stamps
+from fdnt_xp.data.tables import read_positions
+from fdnt_xp.errors import CatalogError, FdntValueError
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inputs:
+    """What to measure, by the options of the command line.
+
+    Parameters
+    ----------
+    image, psf : str
+        FITS files.
+    cell : int or None
+        Side of the cells, if the image is a grid of them.
+    positions : str or None
+        Table of positions, if galaxies are anywhere on the image.
+    stamp_size : int or None
+        Side of the stamp around each position.
+    x_column, y_column : str
+        Columns of that table.
+    origin : int
+        Its first pixel's coordinate.
+    """
+
+    image: str
+    psf: str
+    cell: int | None = None
+    positions: str | None = None
+    stamp_size: int | None = None
+    x_column: str = "x"
+    y_column: str = "y"
+    origin: int = 0
+
+    @property
+    def layout(self) -> str:
+        """How the stamps are found: "grid", "positions" or "cube"."""
+        if self.cell is not None:
+            return "grid"
+        return "positions" if self.positions is not None else "cube"
+
+    def refuse_as_output(self, output: str) -> None:
+        """Raise `CatalogError` if the output would replace one of the inputs."""
+        for path in (self.image, self.psf, self.positions):
+            if path is not None and Path(path).resolve() == Path(output).resolve():
+                raise CatalogError(f"{output} is an input; choose another name for the output")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """How to measure it.
+
+    Parameters
+    ----------
+    backend, device, dtype : str
+        See `fdnt_xp.app.backends.load_backend`.
+    oversampling : int
+        PSF pixels per image pixel.
+    noise_variance : float or None
+        Per pixel; measured on the borders of the stamps if None.
+    size : float or None
+        Weight size, if fixed.
+    chunk : int or None
+        Galaxies at a time.
+    quiet : bool
+        No progress bar.
+    """
+
+    backend: str = "numpy"
+    device: str | None = None
+    dtype: str = "float64"
+    oversampling: int = 1
+    noise_variance: float | None = None
+    size: float | None = None
+    chunk: int | None = None
+    quiet: bool = False
+
+
+def open_source(inputs: Inputs) -> StampSource:
+    """Open the image, and find the stamps in it.
+
+    Raises
+    ------
+    FdntValueError
+        If the options do not say how an image is divided.
+    """
+    if inputs.cell is not None and inputs.positions is not None:
+        raise FdntValueError("give --cell or --positions, not both")
+    if (inputs.positions is None) != (inputs.stamp_size is None):
+        raise FdntValueError("--positions and --stamp-size go together")
+    divided = inputs.layout != "cube"
+    pixels = read_image(inputs.image, ndim=(2,) if divided else (2, 3))
+    if inputs.cell is not None:
+        return grid_stamps(pixels, inputs.cell)
+    if inputs.positions is not None and inputs.stamp_size is not None:
+        table = read_positions(
+            inputs.positions,
+            x_column=inputs.x_column,
+            y_column=inputs.y_column,
+            origin=inputs.origin,
+        )
+        return position_stamps(pixels, table.xy, inputs.stamp_size, table.ids)
+    if pixels.ndim == 2:
+        raise FdntValueError(
+            f"{inputs.image} is one image of {pixels.shape[1]} x {pixels.shape[0]} pixels: say "
+            "where its galaxies are, by --cell or by --positions and --stamp-size"
+        )
+    return cube_stamps(pixels)
+
+
+def measure_files(inputs: Inputs, settings: Settings) -> tuple[Table, float]:
+    """Measure an image; return the catalog with its provenance, and the seconds it took."""
+    backend = load_backend(settings.backend, settings.device, settings.dtype)
+    source = open_source(inputs)
+    psf_pixels: Pixels = read_image(inputs.psf, ndim=(2, 3), what="PSF image")
+    noise = find_noise(source, settings.noise_variance)
+    start = time.perf_counter()
+    table = measure_source(
+        source,
+        psf_pixels,
+        backend=backend,
+        noise_variance=noise.variance,
+        oversampling=settings.oversampling,
+        size=settings.size,
+        chunk=settings.chunk,
+        quiet=settings.quiet,
+    )
+    seconds = time.perf_counter() - start
+    positions = inputs.layout == "positions"
+    table.meta = provenance(
+        backend=backend.library,
+        libver=backend.version,
+        device=backend.device,
+        dtype=backend.dtype,
+        image=inputs.image,
+        psfimage=inputs.psf,
+        layout=inputs.layout,
+        cell=inputs.cell,
+        poscat=inputs.positions,
+        stampsiz=inputs.stamp_size,
+        xcolumn=inputs.x_column if positions else None,
+        ycolumn=inputs.y_column if positions else None,
+        origin=inputs.origin if positions else None,
+        oversamp=settings.oversampling,
+        noisevar=noise.variance,
+        noisesrc="given" if noise.border is None else "stamp borders",
+        bordlvl=noise.border.level if noise.border else None,
+        wtsize=settings.size,
+        chunk=settings.chunk,
+    )
+    return table, seconds

@@ -1,0 +1,150 @@
+"""Images from FITS files, mapped into memory where the file allows it."""
+
+from __future__ import annotations
+
+import os
+import re
+import warnings
+import zlib
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from astropy.io import fits
+from astropy.utils.exceptions import AstropyWarning
+from numpy.typing import NDArray
+
+from fdnt_xp.data.files import new_file
+from fdnt_xp.errors import CatalogError
+
+Pixels: TypeAlias = "NDArray[Any]"
+"""Pixels as the file holds them: any number type, either byte order, perhaps on disk still."""
+
+_SHAPES = {2: "an image (ny, nx)", 3: "a cube (n, ny, nx)"}
+_UNREADABLE = (OSError, EOFError, ValueError, TypeError, KeyError, IndexError, zlib.error)
+"""What astropy raises for a file that is not what it says; `VerifyError` has a class of its own."""
+
+
+def read_image(
+    path: str | os.PathLike[str], *, ndim: Collection[int] = (2,), what: str = "image"
+) -> Pixels:
+    """Read the pixels of a FITS file, without loading them if they can be mapped.
+
+    Parameters
+    ----------
+    path : path
+        The file; the first image in it is taken, or that of a named or numbered extension,
+        `file.fits[SCI]` or `file.fits[2]`.
+    ndim : collection of int
+        Which ranks will do: 2 for an image, 3 for a cube.
+    what : str
+        What the file is to the caller, for messages.
+
+    Returns
+    -------
+    array, shape (ny, nx) or (n, ny, nx)
+        As in the file; `native_pixels` makes numbers for computing of it, or of a part.
+
+    Raises
+    ------
+    CatalogError
+        If there is no such file, it is truncated or not FITS, it has no image, or the image
+        has another rank.
+    """
+    file, extension = _split(path)
+    if not file.is_file():
+        problem = "is a folder" if file.is_dir() else "does not exist"
+        raise CatalogError(f"cannot read the {what}: {file} {problem}")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            pixels = _first_image(file, extension, what)
+        except CatalogError:
+            raise
+        except (*_UNREADABLE, fits.VerifyError) as error:
+            reason = _truncation(caught) or re.split(r"\n|\. ", str(error))[0]
+            raise CatalogError(f"cannot read the {what} {file}: {reason}") from error
+    if reason := _truncation(caught):
+        raise CatalogError(f"cannot read the {what} {file}: {reason}")
+    if pixels.ndim not in ndim:
+        expected = " or ".join(_SHAPES.get(n, f"rank {n}") for n in sorted(ndim))
+        raise CatalogError(
+            f"the {what} {file} has {pixels.ndim} axes, shape {pixels.shape}; expected {expected}"
+        )
+    return pixels
+
+
+def native_pixels(pixels: Pixels) -> Pixels:
+    """Return a contiguous floating-point copy in memory, in the machine's byte order.
+
+    float32 and float64 keep their precision, everything else becomes float64.
+    """
+    name = pixels.dtype.name if pixels.dtype.name in ("float32", "float64") else "float64"
+    return np.array(pixels, dtype=name, order="C")
+
+
+def write_image(
+    pixels: Pixels, path: str | os.PathLike[str], *, overwrite: bool = False, **cards: Any
+) -> None:
+    """Write an image or a cube as FITS, whole or not at all.
+
+    Parameters
+    ----------
+    pixels : array
+        What to write.
+    path : path
+        Where; an existing file is refused unless `overwrite` is True.
+    overwrite : bool
+        Whether a file that exists may be replaced.
+    **cards
+        Header keywords and their values.
+    """
+    hdu = fits.PrimaryHDU(pixels)
+    for keyword, value in cards.items():
+        hdu.header[keyword.upper()] = value
+    with new_file(path, overwrite=overwrite) as temporary:
+        hdu.writeto(temporary)
+
+
+def _split(path: str | os.PathLike[str]) -> tuple[Path, str | int | None]:
+    """Take the extension off `file.fits[ext]`, unless a file has just that name."""
+    match = re.fullmatch(r"(.+)\[([^\[\]]+)\]", os.fspath(path))
+    if match is None or Path(path).exists():
+        return Path(path), None
+    name = match[2].strip()
+    return Path(match[1]), int(name) if name.isdecimal() else name
+
+
+def _first_image(file: Path, extension: str | int | None, what: str) -> Pixels:
+    with fits.open(file, memmap=True) as hdus:
+        if extension is not None:
+            if extension not in hdus if isinstance(extension, str) else extension >= len(hdus):
+                names = ", ".join(f"{i} {hdu.name}".strip() for i, hdu in enumerate(hdus))
+                raise CatalogError(
+                    f"the {what} {file} has no extension {extension!r}; it has {names}"
+                )
+            chosen = [hdus[extension]]
+        else:
+            chosen = hdus
+        for number, hdu in enumerate(chosen):
+            if hdu.is_image and hdu.shape and all(hdu.shape):
+                index = extension if extension is not None else number
+                break
+        else:
+            raise CatalogError(f"the {what} {file} holds no image")
+        try:
+            return np.asarray(hdu.data)
+        except ValueError as error:
+            if "memory-map" not in str(error):
+                raise
+    # Pixels that are stored scaled (BZERO, BSCALE) have to be computed.
+    with fits.open(file, memmap=False) as hdus:
+        return np.asarray(hdus[index].data)
+
+
+def _truncation(caught: list[warnings.WarningMessage]) -> str | None:
+    for warning in caught:
+        if issubclass(warning.category, AstropyWarning) and "truncated" in str(warning.message):
+            return "it is truncated" + str(warning.message).partition("truncated")[2]
+    return None

@@ -1,0 +1,71 @@
+"""Where a catalog came from: what goes into its header so that it can be made again."""
+
+from __future__ import annotations
+
+import math
+from datetime import UTC, datetime
+from typing import Final
+
+import numpy as np
+
+import fdnt_xp
+
+Value = str | int | float | bool
+
+COMMENTS: Final[dict[str, str]] = {
+    "CREATOR": "program that made this table",
+    "FDNTVER": "its version",
+    "NUMPYVER": "version of NumPy",
+    "DATE": "when it was made (UTC)",
+    "BACKEND": "array library",
+    "LIBVER": "its version",
+    "DEVICE": "where the arrays were",
+    "DTYPE": "precision of the computation",
+    "IMAGE": "image that was measured",
+    "PSFIMAGE": "image of the PSF",
+    "POSCAT": "table of positions",
+    "LAYOUT": "how stamps were found: grid, cube, positions",
+    "CELL": "[pix] side of a grid cell",
+    "STAMPSIZ": "[pix] side of a stamp",
+    "XCOLUMN": "column of x in the table of positions",
+    "YCOLUMN": "column of y in the table of positions",
+    "ORIGIN": "first pixel's coordinate in that table",
+    "OVERSAMP": "PSF pixels per image pixel",
+    "NOISEVAR": "noise variance per pixel that was used",
+    "NOISESRC": "where that number came from",
+    "BORDLVL": "median of the stamps' border pixels",
+    "WTSIZE": "[pix] weight size, if it was fixed",
+    "CHUNK": "galaxies measured at a time",
+    "SEED": "seed of the simulation",
+    "SHEAR1": "applied shear g1",
+    "SHEAR2": "applied shear g2",
+    "SNR": "signal to noise of every galaxy",
+}
+"""Keywords of `table.meta`, and thus of the FITS header, with what each means."""
+
+
+def provenance(**facts: Value | None) -> dict[str, Value]:
+    """Return the `meta` of a table: versions, date, and the facts given.
+
+    Parameters
+    ----------
+    **facts
+        By keyword of `COMMENTS`, in lower case. None and NaN mean that there is nothing to
+        say; characters that FITS cannot hold are written as escapes.
+    """
+    meta: dict[str, Value] = {
+        "CREATOR": "fdnt_xp",
+        "FDNTVER": fdnt_xp.__version__,
+        "NUMPYVER": np.__version__,
+        "DATE": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S"),
+    }
+    for name, value in facts.items():
+        keyword = name.upper()
+        if keyword not in COMMENTS:
+            raise KeyError(keyword)
+        if value is None or (isinstance(value, float) and not math.isfinite(value)):
+            continue
+        if isinstance(value, str):
+            value = value.encode("ascii", "backslashreplace").decode("ascii")
+        meta[keyword] = value
+    return meta
