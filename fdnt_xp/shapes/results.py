@@ -39,7 +39,7 @@ class ShapeResult:
     flux : array, shape (n_gal,)
         Amplitude of the best Gaussian galaxy of this size and shape, in units of the image.
     snr : array, shape (n_gal,)
-        `flux` over its error; NaN if no noise variance was given.
+        `flux` over its error at fixed weight; NaN if no noise variance was given.
     flags : array, shape (n_gal,), int32
         Bits of `fdnt_xp.flags.Flag`.
     n_iter : array, shape (n_gal,), int32
@@ -176,7 +176,7 @@ COLUMNS: dict[str, tuple[str | None, str]] = {
     "eg": (None, "ellipticity gradient: response to shear along the axis is 1/(1 - eg)"),
     "size": ("pix", "sigma of the Gaussian factor of the weight"),
     "flux": (None, "flux of the matched Gaussian galaxy, in units of the image"),
-    "snr": (None, "flux over its error"),
+    "snr": (None, "flux over its error at fixed weight"),
     "flags": (None, "measurement flags, bits of fdnt_xp.flags.Flag"),
     "n_iter": (None, "evaluations of the null tests"),
     "status": (None, "status of the solver"),

@@ -1,0 +1,38 @@
+"""The covariance of eta is the scatter of eta."""
+
+from __future__ import annotations
+
+import galsim
+import numpy as np
+import pytest
+
+import fdnt_xp as fx
+from science.galsim_images import psf_image
+
+N_DRAWS = 2000
+
+
+@pytest.mark.parametrize("snr", [100.0, 200.0])
+@pytest.mark.parametrize("size", [None, 2.0])
+def test_scatter_is_what_the_covariance_says(snr, size):
+    psf = galsim.Moffat(beta=3, fwhm=3.0).shear(e=0.1, beta=40 * galsim.degrees)
+    galaxy = galsim.Sersic(1.0, half_light_radius=3.0).shear(e1=0.25, e2=-0.2).shift(0.3, 0.1)
+    clean = galsim.Convolve([galaxy, psf]).drawImage(nx=48, ny=48, scale=1.0, dtype=float).array
+    sigma = np.sqrt(np.sum(clean**2)) / snr
+    rng = np.random.default_rng(20260 + int(snr))
+    stamps = clean + sigma * rng.standard_normal((N_DRAWS, 48, 48))
+    star = fx.Psf.from_image(psf_image(psf, "auto", n=48))
+    shapes = fx.measure_shapes(stamps, star, noise_variance=sigma**2, size=size)
+    assert np.all(shapes.measured)
+    scatter = np.cov(shapes.eta.T)
+    predicted = np.mean(shapes.eta_cov, axis=0)
+    # 2000 draws fix a standard deviation to 1.6 %.
+    np.testing.assert_allclose(np.sqrt(np.diag(scatter)), np.sqrt(np.diag(predicted)), rtol=0.05)
+    correlation = predicted[0, 1] / np.sqrt(predicted[0, 0] * predicted[1, 1])
+    assert scatter[0, 1] / np.sqrt(scatter[0, 0] * scatter[1, 1]) == pytest.approx(
+        correlation, abs=0.08
+    )
+    if size is not None:
+        # snr is the significance under a given weight: a free size scatters the flux more.
+        error = np.mean(shapes.flux / shapes.snr)
+        assert np.std(shapes.flux) / error == pytest.approx(1.0, abs=0.05)
