@@ -17,6 +17,27 @@ TABLE: dict[str, dict[str, tuple[float, float]]] = {
     "backends": {"float64": (0.0, 1e-10), "float32": (0.0, 5e-4)},
     # eta of one galaxy alone and in a batch: matrix products of other sizes block otherwise.
     "batch": {"float64": (0.0, 1e-12), "float32": (0.0, 5e-4)},
+    # A sum over k or pixels, over the sum of its absolute terms: rounding of each term, and
+    # of phases k.x of some 30 radians.
+    "sums": {"float64": (0.0, 3e-14), "float32": (0.0, 5e-6)},
+    # A Gaussian's transform, over T as small as 0.03: the image is cut where it is below
+    # 1e-9 of its sum, and float32 divides the rounding of sums by T.
+    "deconvolved": {"float64": (0.0, 1e-7), "float32": (0.0, 2e-5)},
+    # 𝒯, of order one: a cubic over cells of 1/96 errs by 1e-6 where its slope is one-sided.
+    "weight": {"float64": (0.0, 2e-6), "float32": (0.0, 1e-5)},
+    # d𝒯/dk², of order one in units of its value at 0: a third-order slope, over k/kmax >= 0.05.
+    "weight slope": {"float64": (0.0, 5e-5), "float32": (0.0, 1e-3)},
+    # sigma² from <k²>: integrals of the table of 𝒯, and a table of 128 cells.
+    "matched width": {"float64": (3e-6, 0.0), "float32": (1e-4, 0.0)},
+    # A noise-free Gaussian galaxy on 48 pixels: the stamp cuts it where it is below 1e-8.
+    # float32: the solver stops at 1e-5 in the tests, whose response to eta is about a third.
+    "shapes": {"float64": (0.0, 2e-6), "float32": (0.0, 2e-4)},
+    # The same on stamps of 37 pixels and more.
+    "small stamps": {"float64": (0.0, 2e-4), "float32": (0.0, 4e-4)},
+    # Pixels.
+    "centroids": {"float64": (0.0, 1e-3), "float32": (0.0, 1e-3)},
+    "sizes": {"float64": (2e-3, 0.0), "float32": (2e-3, 0.0)},
+    "gradients": {"float64": (0.0, 1e-3), "float32": (0.0, 1e-3)},
 }
 
 

@@ -47,6 +47,11 @@ class KGrid:
         """Number of modes."""
         return int(self.kx.shape[0])
 
+    @property
+    def n_half_plane(self) -> int:
+        """Number of modes of the `rfftn`, of which `index` names some."""
+        return self.shape[0] * (self.shape[1] // 2 + 1)
+
     @cached_property
     def squares(self) -> Array:
         """`kx², kx ky, ky²` without the half-plane weight, shape (3, n_k)."""

@@ -60,7 +60,7 @@ def deconvolve(stamps: Array, inverse_transfer: Array, grid: KGrid) -> Deconvolv
     xp = array_namespace(stamps=stamps)
     n_gal, ny, nx = stamps.shape
     spectrum = xp.fft.rfftn(stamps, s=grid.shape, axes=(-2, -1))
-    spectrum = xp.reshape(spectrum, (n_gal, grid.shape[0] * (grid.shape[1] // 2 + 1)))
+    spectrum = xp.reshape(spectrum, (n_gal, grid.n_half_plane))
     spectrum = xp.take(spectrum, grid.index, axis=1)
     # Pixel (0, 0) is at -middle from the centre of the stamp, which is where x = 0.
     middle = xp.asarray(
@@ -97,7 +97,8 @@ def mode_phase(grid: KGrid, position: Array) -> Array:
     along_x = xp.exp(complex_like(position[:, 0:1] * kx) * 1j)
     along_y = xp.exp(complex_like(position[:, 1:2] * ky) * 1j)
     phase = along_y[:, :, None] * along_x[:, None, :]
-    return xp.take(xp.reshape(phase, (int(position.shape[0]), -1)), grid.index, axis=1)
+    phase = xp.reshape(phase, (int(position.shape[0]), grid.n_half_plane))
+    return xp.take(phase, grid.index, axis=1)
 
 
 def complex_like(array: Array) -> Array:
