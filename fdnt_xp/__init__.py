@@ -6,7 +6,20 @@ One code for NumPy, torch, JAX and CuPy: the arrays that are given decide where 
 from fdnt_xp.fourier.psf import Psf as Psf
 from fdnt_xp.shapes.measure import measure_shapes as measure_shapes
 from fdnt_xp.shapes.results import ShapeResult as ShapeResult
+from fdnt_xp.shears.estimate import ShearEstimate as ShearEstimate
+from fdnt_xp.shears.from_shapes import shear_from_shapes as shear_from_shapes
+from fdnt_xp.shears.population import population_null as population_null
+from fdnt_xp.shears.stacking import shear_from_stack as shear_from_stack
 
 __version__ = "0.1.0"
 
-__all__ = ["Psf", "ShapeResult", "__version__", "measure_shapes"]
+__all__ = [
+    "Psf",
+    "ShapeResult",
+    "ShearEstimate",
+    "__version__",
+    "measure_shapes",
+    "population_null",
+    "shear_from_shapes",
+    "shear_from_stack",
+]

@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 from fdnt_xp.app.measure import Inputs, Settings, measure_files
 from fdnt_xp.app.plots import plot_catalog, save_figure
 from fdnt_xp.app.summary import format_measured, measured_rows, summary_lines
-from fdnt_xp.arrays import to_numpy
 from fdnt_xp.data.catalog import write_catalog
 from fdnt_xp.data.files import check_writable, make_folder
 from fdnt_xp.data.images import write_image
 from fdnt_xp.data.provenance import provenance
 from fdnt_xp.data.simulate import NOISE_SIGMA, great08_image
-from fdnt_xp.shears.responsivity import mean_shear
+from fdnt_xp.shears.from_shapes import shear_from_eta
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -153,7 +152,8 @@ def shear_lines(
         yield "shear      too few galaxies"
         return
     eta = np.stack([np.asarray(table[name])[good] for name in ("eta1", "eta2")], axis=-1)
-    shear, error = (to_numpy(value) for value in mean_shear(eta))
+    estimate = shear_from_eta(eta)
+    shear, error = estimate.g, estimate.g_err
     if pairs is not None:
         error = error * _pair_factor(eta, pairs[good])
     for i, name in enumerate(("g1", "g2")):

@@ -34,6 +34,8 @@ class KGrid:
         Position of the mode in the flattened `rfftn` of a stamp of `shape`.
     shape : tuple of int
         (ny, nx) of the transform; larger than the stamp where the grid is zero-padded.
+    shear : array, shape (2,), optional
+        The eta-type shear gamma of a counter-shear; absent on the grid of the data.
     """
 
     kx: Array
@@ -41,6 +43,7 @@ class KGrid:
     fold: Array
     index: Array
     shape: tuple[int, int]
+    shear: Array | None = None
 
     @property
     def n_k(self) -> int:
@@ -111,7 +114,24 @@ class KGrid:
             fold=self.fold,
             index=self.index,
             shape=self.shape,
+            shear=gamma,
         )
+
+    def on_stamp(self, position: Array) -> Array:
+        """Return where a position of this grid's frame lies on the stamp, shape (n_gal, 2).
+
+        `kappa.x' = k.x` with `kappa = S_gamma k` holds for `x = S_gamma x'`.
+        """
+        return position if self.shear is None else _moved(shear_matrix(self.shear), position)
+
+    def from_stamp(self, position: Array) -> Array:
+        """Return the position in this grid's frame of one on the stamp, shape (n_gal, 2)."""
+        return position if self.shear is None else _moved(shear_matrix(-self.shear), position)
+
+
+def _moved(matrix: Array, position: Array) -> Array:
+    """Return `M x` for each row; M is symmetric."""
+    return position[:, 0:1] * matrix[0, :] + position[:, 1:2] * matrix[1, :]
 
 
 def half_plane_disc(

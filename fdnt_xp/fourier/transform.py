@@ -37,10 +37,10 @@ class DeconvolvedStamps:
         Parameters
         ----------
         centroid : array, shape (n_gal, 2)
-            x0 in pixels of the stamp from the origin.
+            x0 in pixels from the origin, in the frame of the grid.
         """
         xp = array_namespace(re=self.re)
-        phase = mode_phase(grid, centroid)
+        phase = mode_phase(grid, grid.on_stamp(centroid))
         cos, sin = xp.real(phase), xp.imag(phase)
         return cos * self.re - sin * self.im, sin * self.re + cos * self.im
 

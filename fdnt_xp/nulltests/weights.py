@@ -15,7 +15,7 @@ is inverted once, in a table.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -71,6 +71,13 @@ class Weight:
             width_range=xp.take(self.width_range, rows, axis=0),
             square_range=xp.take(self.square_range, rows, axis=0),
         )
+
+    def shrunk(self, factor: float) -> Weight:
+        """Return the weights with their discs smaller by a factor, `kmax/factor`.
+
+        For a counter-sheared grid: the disc then stays inside that of the data.
+        """
+        return replace(self, kmax=self.kmax / factor)
 
     @property
     def shared(self) -> bool:

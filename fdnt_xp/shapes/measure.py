@@ -115,7 +115,7 @@ def measure_shapes(
     >>> shapes.e.round(6)  # before the PSF, of variance 4: (14 - 8)/(14 + 8)
     array([[0.272727, 0.      ]])
     """
-    xp, stamps = _checked(stamps, psf)
+    xp, stamps = check_stamps(stamps, psf)
     n_gal = int(stamps.shape[0])
     noise = _noise_column(xp, noise_variance, stamps)
     for name, value, least in (("padding", padding, 1), ("max_iter", max_iter, 0)):
@@ -128,8 +128,8 @@ def measure_shapes(
     if n_gal == 0:
         return ShapeResult.unmeasured(stamps)
 
-    job = _prepare(xp, stamps, psf, padding, size, max_iter)
-    n_chunk = chunk_size or _chunk_size(job.coarse, stamps)
+    job = prepare(xp, stamps, psf, padding, size, max_iter)
+    n_chunk = chunk_size or galaxies_at_once(job.coarse, stamps)
     parts = []
     for start in range(0, n_gal, n_chunk):
         rows = slice(start, min(start + n_chunk, n_gal))
@@ -138,7 +138,7 @@ def measure_shapes(
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Job:
+class Job:
     """What all galaxies share, and the PSF, of which there may be one for each."""
 
     psf: Psf
@@ -149,7 +149,7 @@ class _Job:
     size: float | None
     max_iter: int
 
-    def rows(self, rows: slice) -> _Job:
+    def rows(self, rows: slice) -> Job:
         """Return the job of a range of galaxies."""
         if self.weight.shared:
             return self
@@ -157,11 +157,11 @@ class _Job:
         device = device_of(self.psf.kmax)
         return self.take(xp.arange(rows.start, rows.stop, dtype=xp.int64, device=device))
 
-    def take(self, rows: Array) -> _Job:
+    def take(self, rows: Array) -> Job:
         """Return the job of the given galaxies (integer array)."""
         if self.weight.shared:
             return self
-        return _Job(
+        return Job(
             psf=self.psf.take(rows),
             weight=self.weight.take(rows),
             coarse=self.coarse,
@@ -172,9 +172,9 @@ class _Job:
         )
 
 
-def _prepare(
+def prepare(
     xp: ModuleType, stamps: Array, psf: Psf, padding: int, size: float | None, max_iter: int
-) -> _Job:
+) -> Job:
     """Make the k grids and the tables of the weight."""
     ny, nx = (int(n) for n in stamps.shape[1:])
     shape = (padding * ny, padding * nx)
@@ -186,7 +186,7 @@ def _prepare(
             "such stamps resolve"
         )
     like = {"dtype": stamps.dtype, "device": device_of(stamps)}
-    return _Job(
+    return Job(
         psf=psf.restricted(_FEWEST_CELLS * cell),
         # A weight of this size is one cell of the k grid wide.
         weight=make_weight(psf, largest_size=1.0 / cell),
@@ -198,20 +198,10 @@ def _prepare(
     )
 
 
-def _measure_chunk(job: _Job, stamps: Array, noise: Array) -> ShapeResult:
+def _measure_chunk(job: Job, stamps: Array, noise: Array) -> ShapeResult:
     """Measure on the coarse grid, then the few that need it on the fine one."""
     xp = array_namespace(stamps=stamps)
-    finite = xp.all(xp.all(xp.isfinite(stamps), axis=-1), axis=-1)
-    stamps = xp.where(finite[:, None, None], stamps, xp.zeros_like(stamps))
-    brightest = xp.max(xp.max(stamps, axis=-1), axis=-1)
-    faintest = xp.min(xp.min(stamps, axis=-1), axis=-1)
-    flags = xp.zeros_like(noise, dtype=xp.int32)
-    for reason, holds in (
-        (Flag.NON_FINITE_PIXEL, ~finite),
-        (Flag.NO_SIGNAL, finite & (brightest == faintest)),
-        (Flag.BAD_PSF, xp.broadcast_to(~job.psf.usable, finite.shape)),
-    ):
-        flags = flags + xp.astype(holds, xp.int32) * int(reason)
+    stamps, flags = screen(stamps, job.psf)
     measurable = flags == 0
 
     result, finer = _measure_on(job, job.coarse, stamps, noise, flags)
@@ -237,8 +227,32 @@ def _measure_chunk(job: _Job, stamps: Array, noise: Array) -> ShapeResult:
     return merged.take(xp.argsort(order))
 
 
+def screen(stamps: Array, psf: Psf) -> tuple[Array, Array]:
+    """Return stamps that do no harm, zero where not finite, and why some cannot be measured.
+
+    Returns
+    -------
+    stamps : array, shape (n_gal, ny, nx)
+    flags : array, shape (n_gal,), int32
+        Zero, or a reason of `fdnt_xp.flags.Flag`.
+    """
+    xp = array_namespace(stamps=stamps)
+    finite = xp.all(xp.all(xp.isfinite(stamps), axis=-1), axis=-1)
+    stamps = xp.where(finite[:, None, None], stamps, xp.zeros_like(stamps))
+    brightest = xp.max(xp.max(stamps, axis=-1), axis=-1)
+    faintest = xp.min(xp.min(stamps, axis=-1), axis=-1)
+    flags = xp.zeros_like(brightest, dtype=xp.int32)
+    for reason, holds in (
+        (Flag.NON_FINITE_PIXEL, ~finite),
+        (Flag.NO_SIGNAL, finite & (brightest == faintest)),
+        (Flag.BAD_PSF, xp.broadcast_to(~psf.usable, finite.shape)),
+    ):
+        flags = flags + xp.astype(holds, xp.int32) * int(reason)
+    return stamps, flags
+
+
 def _measure_on(
-    job: _Job, grid: KGrid, stamps: Array, noise: Array, flags: Array
+    job: Job, grid: KGrid, stamps: Array, noise: Array, flags: Array
 ) -> tuple[ShapeResult, Array]:
     """Measure on one grid; return the shapes, and which a finer grid should measure again."""
     xp = array_namespace(stamps=stamps)
@@ -248,7 +262,7 @@ def _measure_on(
     tests = NullTests(
         grid=grid, galaxies=galaxies, weight=job.weight, length=job.length, fixed_width=fixed
     )
-    root = _solve(job, tests, min(stamps.shape[1:]))
+    root = solve(job, tests, min(stamps.shape[1:]))
     result = describe(
         tests,
         root,
@@ -262,15 +276,16 @@ def _measure_on(
     return result, elongated | ~root.success
 
 
-def _solve(job: _Job, tests: NullTests, side: int) -> RootResult:
+def solve(job: Job, tests: NullTests, side: int) -> RootResult:
     """Find the root of the null tests, from a round galaxy at its first centroid."""
     xp = array_namespace(kmax=job.weight.kmax)
-    grid = tests.grid
-    radius_squared = (grid.kx**2 + grid.ky**2)[None, :]
-    square = xp.broadcast_to(radius_squared, (int(job.weight.kmax.shape[0]), grid.n_k))
-    psf_factor, _ = job.weight.psf_factor(square, xp.ones_like(job.weight.kmax))
-    wide = psf_factor * xp.exp(-0.5 * (_WIDE * side) ** 2 * square)
-    centre = starting_centroid(grid, tests.galaxies, wide, job.length, reach=0.5 * side)
+    centre = starting_centroid(
+        tests.grid,
+        tests.galaxies,
+        wide_weight(job.weight, tests.grid, side),
+        job.length,
+        reach=0.5 * side,
+    )
     start = xp.concat([xp.zeros_like(centre), centre / job.length], axis=-1)
     options = DoglegOptions(
         max_iter=job.max_iter,
@@ -282,7 +297,32 @@ def _solve(job: _Job, tests: NullTests, side: int) -> RootResult:
     return find_root(tests, start, options=options)
 
 
-def _checked(stamps: Array, psf: Psf) -> tuple[ModuleType, Array]:
+def wide_weight(
+    weight: Weight, grid: KGrid, side: int, applied_shear: Array | None = None
+) -> Array:
+    """Return the weight of the first centroid, shape (n_psf, n_k).
+
+    Parameters
+    ----------
+    side : int
+        Shorter side of the stamps, pixels.
+    applied_shear : array, shape (2,), optional
+        Makes the weight round in the frame from which this eta is taken off: the null of
+        its dipole then follows that shear. By default it is round on the image.
+    """
+    xp = array_namespace(kmax=weight.kmax)
+    shrink = xp.ones_like(weight.kmax)
+    if applied_shear is not None:
+        grid = grid.sheared(applied_shear)
+        # As in the null tests: the weight may not reach out of the disc.
+        shrink = shrink * xp.exp(0.5 * xp.sqrt(xp.sum(applied_shear**2)))
+    radius_squared = (grid.kx**2 + grid.ky**2)[None, :]
+    square = xp.broadcast_to(radius_squared, (int(weight.kmax.shape[0]), grid.n_k))
+    psf_factor, _ = weight.psf_factor(square, shrink)
+    return psf_factor * xp.exp(-0.5 * (_WIDE * side) ** 2 * square)
+
+
+def check_stamps(stamps: Array, psf: Psf) -> tuple[ModuleType, Array]:
     """Refuse what cannot be measured; return the namespace and the stamps as floats."""
     if not isinstance(psf, Psf):
         raise FdntTypeError(
@@ -323,7 +363,7 @@ def _noise_column(xp: ModuleType, noise_variance: float | Array | None, stamps: 
     return xp.broadcast_to(noise, like.shape)
 
 
-def _chunk_size(grid: KGrid, stamps: Array) -> int:
+def galaxies_at_once(grid: KGrid, stamps: Array) -> int:
     """Return how many galaxies fit the memory of a chunk."""
     ny, nx = stamps.shape[1:]
     numbers = _FIELDS * grid.n_k + 3 * int(ny) * int(nx)
