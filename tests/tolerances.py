@@ -29,11 +29,22 @@ TABLE: dict[str, dict[str, tuple[float, float]]] = {
     "weight slope": {"float64": (0.0, 5e-5), "float32": (0.0, 1e-3)},
     # sigma² from <k²>: integrals of the table of 𝒯, and a table of 128 cells.
     "matched width": {"float64": (3e-6, 0.0), "float32": (1e-4, 0.0)},
+    # Null tests over t0, and widths: sums over k of data divided by T >= 0.03.
+    "tests": {"float64": (0.0, 1e-11), "float32": (0.0, 3e-4)},
+    # Their derivatives against central differences of step 1e-5, good to 1e-9 of terms of
+    # order ten; modes that cross a node of the table of 𝒯 within the step add as much.
+    "test slopes": {"float64": (0.0, 3e-7), "float32": (0.0, 5e-3)},
+    # Null tests over t0 at the truth: the sum over cells of 2 pi/30 is not quite isotropic.
+    "null": {"float64": (0.0, 1e-5), "float32": (0.0, 1e-4)},
+    # Covariances against differences of step 1e-4 of the peak, in units of the largest.
+    "noise": {"float64": (0.0, 1e-6), "float32": (0.0, 2e-3)},
     # A noise-free Gaussian galaxy on 48 pixels: the stamp cuts it where it is below 1e-8.
     # float32: the solver stops at 1e-5 in the tests, whose response to eta is about a third.
     "shapes": {"float64": (0.0, 2e-6), "float32": (0.0, 2e-4)},
     # The same on stamps of 37 pixels and more.
     "small stamps": {"float64": (0.0, 2e-4), "float32": (0.0, 4e-4)},
+    # The shear of eight such galaxies.
+    "nulls": {"float64": (0.0, 1e-7), "float32": (0.0, 5e-5)},
     # Pixels.
     "centroids": {"float64": (0.0, 1e-3), "float32": (0.0, 1e-3)},
     "sizes": {"float64": (2e-3, 0.0), "float32": (2e-3, 0.0)},

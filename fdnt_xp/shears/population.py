@@ -41,6 +41,9 @@ _STEP: Final = 0.02
 """Step in gamma of the numerical response: far above the solver's noise, and its error,
 of second order in the step, changes the speed of the search, not its root."""
 _MAX_STEPS: Final = 12
+_TOLERANCE: Final = 1e-9
+_TOLERANCE_FLOAT32: Final = 2e-5
+"""Smallest step in gamma worth taking: above the rounding of each galaxy's solution."""
 _LARGEST_SHEAR: Final = 0.3
 """|g| beyond which the weight's disc would have to shrink to less than three quarters."""
 _FROZEN_SIZE: Final = 1.5
@@ -206,7 +209,7 @@ def _estimate(xp: ModuleType, sample: _Sample, max_shear: float, method: str) ->
         _pair(xp.mean(v, axis=0)),
         jac,
         largest=2.0 * math.atanh(max_shear),
-        tolerance=1e-10 if sample.stamps.dtype == xp.float64 else 1e-6,
+        tolerance=_TOLERANCE if sample.stamps.dtype == xp.float64 else _TOLERANCE_FLOAT32,
     )
     conformal = xp.asarray(gamma, **like)
     errors = _errors(xp, v, response)

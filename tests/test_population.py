@@ -1,0 +1,238 @@
+"""The population null: exact on isotropic samples, covariant, and clear about what it cannot do."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from array_api_extra.testing import assert_close
+
+import fdnt_xp as fx
+from fdnt_xp.errors import FdntTypeError, FdntValueError, RangeError, ShapeMismatchError
+from fdnt_xp.shear import shear_matrix
+from fdnt_xp.shears.population import find_null
+from fdnt_xp.shears.weights import ShapeWeight
+from images import PSF_COVARIANCE, gaussian_image, star
+from tolerances import tolerance
+
+STATISTICS = ["frozen", "eta"]
+SHEAR = np.array([0.03, -0.02])
+
+
+def eta_of(g):
+    g = np.asarray(g)
+    norm = np.linalg.norm(g)
+    return 2.0 * math.atanh(norm) * g / norm if norm else np.zeros(2)
+
+
+def ring(g, *, n=8, eta=0.7, sigma=2.2, start=0.1, shape=(48, 48)):
+    """Return elliptical Gaussians at n position angles, lensed by g, behind the PSF of `star`."""
+    lens = shear_matrix(eta_of(g))
+    images = []
+    for angle in start + np.pi * np.arange(n) / n:
+        intrinsic = shear_matrix(eta * np.array([np.cos(2 * angle), np.sin(2 * angle)]))
+        distortion = lens @ intrinsic
+        # A round Gaussian distorted by M has the covariance M Mᵀ.
+        covariance = sigma**2 * distortion @ distortion.T + PSF_COVARIANCE
+        images.append(gaussian_image(covariance, shape, centre=(0.3 * np.cos(5 * angle), 0.2)))
+    return np.stack(images)
+
+
+@pytest.fixture
+def psf(to_xp, dtype):
+    return fx.Psf.from_image(to_xp(star(), dtype))
+
+
+# --- the answer ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("statistic", STATISTICS)
+def test_a_ring_gives_its_shear(statistic, psf, xp, dtype, to_xp):
+    estimate = fx.population_null(to_xp(ring(SHEAR), dtype), psf, statistic=statistic)
+    assert_close(estimate.g, to_xp(SHEAR, dtype), **tolerance("nulls", dtype), xp=xp)
+    assert estimate.n_used == 8
+    assert estimate.n_excluded == 0
+    assert statistic in estimate.method
+
+
+@pytest.mark.parametrize("statistic", STATISTICS)
+@pytest.mark.parametrize("angle", [0.0, 45.0, 90.0, 111.0])
+@pytest.mark.parametrize("length", [0.0, 0.02, 0.09])
+def test_any_shear_at_any_angle(statistic, angle, length):
+    g = length * np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])
+    estimate = fx.population_null(ring(g), fx.Psf.from_image(star()), statistic=statistic)
+    np.testing.assert_allclose(estimate.g, g, atol=1e-7)
+
+
+@pytest.mark.parametrize("statistic", STATISTICS)
+def test_turning_the_images_turns_the_answer(statistic):
+    # A quarter turn of the pixels is exact; without a ring's symmetry the answer is no shear
+    # in particular, but it must turn.
+    images = ring((0.05, 0.02), n=5, eta=0.4)
+    images = np.concatenate([images[:2], images[3:]])
+    straight = fx.population_null(images, fx.Psf.from_image(star()), statistic=statistic)
+    turned = fx.population_null(
+        np.rot90(images, axes=(1, 2)), fx.Psf.from_image(np.rot90(star())), statistic=statistic
+    )
+    np.testing.assert_allclose(turned.g, -straight.g, atol=1e-9)
+    # The response is a forward difference, which does not turn exactly.
+    np.testing.assert_allclose(turned.g_err, straight.g_err, rtol=2e-3)
+
+
+def test_a_weight_bounds_the_influence_and_keeps_the_answer():
+    images, psf = ring(SHEAR), fx.Psf.from_image(star())
+    for weight in (ShapeWeight.gaussian(0.5), ShapeWeight.uniform()):
+        estimate = fx.population_null(images, psf, statistic="eta", weight=weight)
+        np.testing.assert_allclose(estimate.g, SHEAR, atol=1e-7)
+
+
+@pytest.mark.parametrize("statistic", STATISTICS)
+def test_a_given_size_and_a_smaller_reach(statistic):
+    images, psf = ring(SHEAR), fx.Psf.from_image(star())
+    estimate = fx.population_null(images, psf, statistic=statistic, size=2.0, max_shear=0.05)
+    np.testing.assert_allclose(estimate.g, SHEAR, atol=1e-7)
+
+
+def test_a_psf_for_each_galaxy(xp, to_xp):
+    images = to_xp(ring(SHEAR))
+    stars = to_xp(np.stack([star()] * 8))
+    estimate = fx.population_null(images, fx.Psf.from_image(stars), chunk_size=3)
+    assert_close(estimate.g, to_xp(SHEAR), rtol=0, atol=1e-7, xp=xp)
+
+
+# --- batches and bad galaxies --------------------------------------------------------
+
+
+@pytest.mark.parametrize("statistic", STATISTICS)
+@pytest.mark.parametrize("chunk_size", [1, 3, 100])
+def test_chunks_change_nothing(statistic, chunk_size):
+    images, psf = ring(SHEAR), fx.Psf.from_image(star())
+    together = fx.population_null(images, psf, statistic=statistic)
+    apart = fx.population_null(images, psf, statistic=statistic, chunk_size=chunk_size)
+    np.testing.assert_allclose(apart.g, together.g, atol=1e-10)
+    np.testing.assert_allclose(apart.g_err, together.g_err, rtol=1e-6)
+
+
+@pytest.mark.parametrize("statistic", STATISTICS)
+def test_bad_galaxies_count_as_nothing(statistic, psf, xp, dtype, to_xp):
+    good = ring(SHEAR)
+    bad = np.stack([np.full((48, 48), np.nan), np.zeros((48, 48)), -good[0]])
+    estimate = fx.population_null(
+        to_xp(np.concatenate([good, bad]), dtype), psf, statistic=statistic
+    )
+    assert_close(estimate.g, to_xp(SHEAR, dtype), **tolerance("nulls", dtype), xp=xp)
+    assert (estimate.n_used, estimate.n_excluded) == (8, 3)
+
+
+# --- errors --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("statistic", STATISTICS)
+def test_errors_are_the_scatter(statistic):
+    rng = np.random.default_rng(3)
+    psf = fx.Psf.from_image(star())
+    etas, starts = rng.uniform(0.0, 0.4, 400), rng.uniform(0.0, np.pi, 400)
+    pool = np.concatenate(
+        [ring(SHEAR, n=1, eta=e, start=a) for e, a in zip(etas, starts, strict=True)]
+    )
+    options = {"statistic": statistic, "max_shear": 0.2}
+    estimates = [fx.population_null(part, psf, **options) for part in np.split(pool, 20)]
+    scatter = np.std([one.g for one in estimates], axis=0, ddof=1)
+    predicted = np.sqrt(np.mean([one.g_err**2 for one in estimates], axis=0))
+    # Twenty draws of two components fix the ratio to 11 %.
+    assert np.sqrt(np.mean((scatter / predicted) ** 2)) == pytest.approx(1.0, abs=0.35)
+    whole = fx.population_null(pool, psf, **options)
+    np.testing.assert_allclose(whole.g_err_jackknife, whole.g_err, rtol=0.35)
+    assert np.all(np.abs(whole.g - SHEAR) < 4.0 * whole.g_err)
+
+
+# --- bad calls -----------------------------------------------------------------------
+
+
+def test_one_galaxy_is_no_population(psf, dtype, to_xp):
+    with pytest.raises(FdntValueError, match="stamps holds 1 galaxies; a null needs two"):
+        fx.population_null(to_xp(ring(SHEAR)[:1], dtype), psf)
+
+
+@pytest.mark.parametrize("statistic", STATISTICS)
+def test_a_sample_without_a_usable_galaxy(statistic, psf, dtype, to_xp):
+    with pytest.raises(FdntValueError, match="only 0 of 3 galaxies can be used"):
+        fx.population_null(to_xp(np.full((3, 48, 48), np.nan), dtype), psf, statistic=statistic)
+
+
+@pytest.mark.parametrize("statistic", STATISTICS)
+def test_a_shear_out_of_reach(statistic):
+    images, psf = ring((0.12, 0.0)), fx.Psf.from_image(star())
+    with pytest.raises(FdntValueError, match=r"no null within max_shear.*allowed is 0\.05"):
+        fx.population_null(images, psf, statistic=statistic, max_shear=0.05)
+    wider = fx.population_null(images, psf, statistic=statistic, max_shear=0.2)
+    # Eight angles are isotropic to so large a shear only to this.
+    np.testing.assert_allclose(wider.g, [0.12, 0.0], atol=5e-6)
+
+
+@pytest.mark.parametrize("max_shear", [0.0, -0.1, 0.31, float("nan")])
+def test_reaches_out_of_range(max_shear):
+    with pytest.raises(RangeError, match="max_shear = "):
+        fx.population_null(ring(SHEAR), fx.Psf.from_image(star()), max_shear=max_shear)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"statistic": "mean"}, FdntValueError, 'statistic must be "frozen" or "eta"'),
+        ({"weight": ShapeWeight.gaussian(0.5)}, FdntValueError, "weight goes with"),
+        ({"size": -1.0}, RangeError, "size = -1"),
+        ({"padding": 0}, RangeError, "padding = 0"),
+        ({"chunk_size": 0}, RangeError, "chunk_size = 0"),
+    ],
+)
+def test_other_bad_options(options, error, message):
+    with pytest.raises(error, match=message):
+        fx.population_null(ring(SHEAR), fx.Psf.from_image(star()), **options)
+
+
+def test_bad_arrays_are_refused_as_by_measure_shapes():
+    psf = fx.Psf.from_image(star())
+    with pytest.raises(ShapeMismatchError, match="stamps must have the shape"):
+        fx.population_null(star(), psf)
+    with pytest.raises(FdntTypeError, match="psf must be a Psf"):
+        fx.population_null(ring(SHEAR), star())
+
+
+# --- the search ----------------------------------------------------------------------
+
+
+def test_the_search_finds_a_bent_null():
+    def mean(gamma):
+        x, y = gamma[0] - 0.08, gamma[1] + 0.05
+        return -x + 0.3 * x * y, -1.2 * y + 0.4 * x * x
+
+    calls = []
+
+    def counted(gamma):
+        calls.append(gamma)
+        return mean(gamma)
+
+    jac = [(-1.05, 0.0), (0.0, -1.1)]
+    found = find_null(counted, mean((0.0, 0.0)), jac, largest=1.0, tolerance=1e-12)
+    np.testing.assert_allclose(found, (0.08, -0.05), atol=1e-11)
+    assert len(calls) <= 8
+
+
+def test_a_dead_response_is_said():
+    with pytest.raises(FdntValueError, match="does not respond"):
+        find_null(
+            lambda _: (1.0, 1.0), (1.0, 1.0), [(0.0, 0.0), (0.0, 0.0)], largest=1, tolerance=0
+        )
+
+
+def test_a_search_without_end_is_said():
+    with pytest.raises(FdntValueError, match="no null found in"):
+        find_null(
+            lambda g: (1e-3 * math.cos(1e6 * g[0]), 1e-3 * math.sin(1e6 * g[0])),
+            (1e-3, 0.0),
+            [(-1.0, 0.0), (0.0, -1.0)],
+            largest=10.0,
+            tolerance=1e-15,
+        )
