@@ -20,7 +20,7 @@ from types import ModuleType
 from fdnt_xp.arrays import Array, array_namespace
 
 _SMALL_ETA_SQUARED = 1e-4
-"""Below this |eta|², three terms of the series are exact to 2e-16 and divisions are not safe."""
+"""Below this `|eta|²`, three terms of the series are exact to 2e-16 and divisions are not safe."""
 
 
 def distortion_from_eta(eta: Array) -> Array:

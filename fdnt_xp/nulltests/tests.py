@@ -312,7 +312,7 @@ class NullTests:
     def _ln_mean_square_slopes(
         self, view: _View, a2: Array, flux: Array, square: Array
     ) -> tuple[Array, Array]:
-        """Return the derivatives of ln<|k'|²> by (eta1, eta2, x0, y0) and by ln s."""
+        """Return the derivatives of `ln<|k'|²>` by (eta1, eta2, x0, y0) and by ln s."""
         xp = array_namespace(flux=flux)
         f0 = view.forms.forms[0]
         _, b2, b4 = self.grid.even_moments(view.psf_slope * view.re)

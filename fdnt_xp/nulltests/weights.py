@@ -120,7 +120,7 @@ class Weight:
         width : array, shape (n_gal,)
             sigma², held inside the range of sizes.
         slope : array, shape (n_gal,)
-            d(sigma²)/d(1/<|k'|²>); zero at the bounds.
+            `d(sigma²)/d(1/<|k'|²>)`; zero at the bounds.
         at_bound : array, shape (n_gal,), bool
             Where the equation asks for a width beyond the range.
         """

@@ -35,7 +35,7 @@ from fdnt_xp.shapes.results import ShapeResult
 from fdnt_xp.shapes.solution import describe
 
 _FINE_ABOVE: Final = 1.5
-"""|eta| beyond which the weight, squeezed by exp(-|eta|/2), covers few cells of the k grid."""
+"""`|eta|` beyond which the weight, squeezed by `exp(-|eta|/2)`, covers few cells of the k grid."""
 _FINE: Final = 2
 """How much finer the second grid is, along each axis."""
 _FEWEST_CELLS: Final = 3.0

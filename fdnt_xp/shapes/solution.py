@@ -12,7 +12,7 @@ from fdnt_xp.nulltests.tests import NullTests, TestNoise
 from fdnt_xp.shapes.results import ShapeResult
 
 _MOST_ELLIPTICAL: Final = 4.0
-"""|eta| beyond which no root is believed: an axis ratio of 55, thinner than any k grid."""
+"""`|eta|` beyond which no root is believed: an axis ratio of 55, thinner than any k grid."""
 
 _STATUS_FLAGS: Final = {
     Status.MAX_ITER: Flag.DID_NOT_CONVERGE,

@@ -5,7 +5,7 @@ with gamma taken off. A statistic is a spin-2 quantity of each galaxy in that fr
 numbers that turn with the image. If gamma is the shear that was applied, the galaxies are
 isotropic there and its mean is zero, whatever the PSF and the morphology.
 
-The weight ends at `kmax/reach`, so that its disc, sheared by any |gamma| <= 2 ln(reach),
+The weight ends at `kmax/reach`, so that its disc, sheared by any `|gamma|` <= 2 ln(reach),
 stays where the PSF has left information.
 """
 
@@ -25,7 +25,7 @@ from fdnt_xp.shapes.centroid import DipoleTests
 from fdnt_xp.shears.weights import ShapeWeight
 
 _RADIUS: Final = 1.0
-"""First trust radius, in |eta| and in the length unit of centroids."""
+"""First trust radius, in `|eta|` and in the length unit of centroids."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -49,7 +49,7 @@ def shear_from_shapes(
     shapes : ShapeResult
         From `measure_shapes`. Galaxies that are not `measured` are left out.
     weight : ShapeWeight, callable or str
-        What a shape counts, `w(|eta|)`: a `ShapeWeight`, a function of |eta|, or "uniform",
+        What a shape counts, `w(|eta|)`: a `ShapeWeight`, a function of `|eta|`, or "uniform",
         "gaussian" (exp(-eta²)), "lorentzian" (1/(1 + eta²)).
     galaxy_weight : array, shape (n_gal,), optional
         Multiplies `w`. Finite and not negative where `measured`, and not a function of the

@@ -45,7 +45,7 @@ _TOLERANCE: Final = 1e-9
 _TOLERANCE_FLOAT32: Final = 2e-5
 """Smallest step in gamma worth taking: above the rounding of each galaxy's solution."""
 _LARGEST_SHEAR: Final = 0.3
-"""|g| beyond which the weight's disc would have to shrink to less than three quarters."""
+"""`|g|` beyond which the weight's disc would have to shrink to less than three quarters."""
 _FROZEN_SIZE: Final = 1.5
 """Default size of the frozen weight in lengths of about the size of the PSF."""
 _JACKKNIFE_GROUPS: Final = 50
@@ -82,7 +82,7 @@ def population_null(
         about 1.5 times the size of the PSF, one for the whole sample; for "eta" by default
         matched to each galaxy.
     max_shear : float
-        Largest |g| in reach. The weight's disc is smaller than the PSF's by
+        Largest `|g|` in reach. The weight's disc is smaller than the PSF's by
         `sqrt((1 + max_shear)/(1 - max_shear))`, which costs resolution.
     padding, chunk_size : int
         As for `measure_shapes`.
@@ -245,7 +245,7 @@ def find_null(
     jac : list of 2 tuples
         Its derivative at 0, rows by component of the mean.
     largest : float
-        Largest |gamma| that may be asked for.
+        Largest `|gamma|` that may be asked for.
     tolerance : float
         A step smaller than this ends the search.
 

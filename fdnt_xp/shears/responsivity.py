@@ -1,6 +1,6 @@
 """How the mean shape of galaxies responds to shear, to first and to third order.
 
-Isotropic galaxies of one |eta| get from a reduced shear g along x the mean
+Isotropic galaxies of one `|eta|` get from a reduced shear g along x the mean::
 
     <w eta1> = 2 g R1 + 2 g³ R3,
     R1 = ½ [(eta w' + w)/(1 - EG) + Y w],      Y = eta/tanh eta,
@@ -28,7 +28,7 @@ def R1(
     Parameters
     ----------
     abs_eta : array, shape (n_gal,), real floating
-        |eta|, finite and not negative.
+        `|eta|`, finite and not negative.
     weight : ShapeWeight, callable or str
         `w(|eta|)`; a name or function as for `as_shape_weight`.
     eg : array, shape (n_gal,), optional
@@ -61,7 +61,7 @@ def R3(abs_eta: Array, weight: ShapeWeight | Function | str = "uniform") -> Arra
     Parameters
     ----------
     abs_eta : array, shape (n_gal,), real floating
-        |eta|, finite and not negative.
+        `|eta|`, finite and not negative.
     weight : ShapeWeight, callable or str
         `w(|eta|)`; a name or function as for `as_shape_weight`.
 
@@ -117,7 +117,7 @@ def third_order(abs_eta: Array, w: WeightExpansion) -> Array:
 
 
 def _checked(abs_eta: Array, eg: Array | None) -> Array:
-    """Refuse what is not one number for each galaxy; return |eta| as floats."""
+    """Refuse what is not one number for each galaxy; return `|eta|` as floats."""
     xp = array_namespace(abs_eta=abs_eta, eg=eg)
     abs_eta = as_floating(xp, abs_eta, "abs_eta")
     require_dtype(abs_eta.dtype, eg=eg)

@@ -1,7 +1,7 @@
 """Weights of shapes in a mean: `w(|eta|)` and its first three derivatives.
 
 A shape counts `w(|eta|) eta`. Any w that is smooth as a function of `(eta1, eta2)`, hence
-even in |eta|, has a responsivity; to third order that takes w', w'' and w'''.
+even in `|eta|`, has a responsivity; to third order that takes w', w'' and w'''.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from fdnt_xp.errors import (
 )
 
 Function: TypeAlias = Callable[[Array], Array]
-"""An elementwise function of |eta|, shape (n,) to (n,), in the library of its argument."""
+"""An elementwise function of `|eta|`, shape (n,) to (n,), in the library of its argument."""
 
 _STEP: Final = 0.04
 """Of `scale`: the step of the numerical derivatives."""
@@ -44,13 +44,13 @@ class ShapeWeight:
     ----------
     function : callable
         `w(abs_eta)`, elementwise on arrays of shape (n,) of any library; finite, not
-        negative, and smooth as a function of `(eta1, eta2)`: even in |eta|, no cusp at 0.
+        negative, and smooth as a function of `(eta1, eta2)`: even in `|eta|`, no cusp at 0.
     derivatives : tuple of 3 callables, optional
-        `w'`, `w''` and `w'''` by |eta|. Without them they are taken by central differences
+        `w'`, `w''` and `w'''` by `|eta|`. Without them they are taken by central differences
         over 21 points in float64: to 1e-10 of w at its `scale` for weights like those
         below. A warning says where w is not smooth enough for that.
     scale : float
-        |eta| over which w varies, for the numerical derivatives.
+        `|eta|` over which w varies, for the numerical derivatives.
     name : str
         For reports.
 
@@ -127,7 +127,7 @@ class ShapeWeight:
         return _checked_values(self.name, abs_eta, self.function(abs_eta))
 
     def expand(self, abs_eta: Array) -> WeightExpansion:
-        """Return w with its derivatives at |eta|, shape (n,), in the dtype of `abs_eta`."""
+        """Return w with its derivatives at `|eta|`, shape (n,), in the dtype of `abs_eta`."""
         xp = array_namespace(abs_eta=abs_eta)
         value = self(abs_eta)
         if self.derivatives is None:
@@ -177,14 +177,14 @@ class ShapeWeight:
 
 @dataclass(frozen=True, kw_only=True)
 class WeightExpansion:
-    """A weight and its derivatives by |eta| at every shape; all of shape (n,).
+    """A weight and its derivatives by `|eta|` at every shape; all of shape (n,).
 
     Parameters
     ----------
     value, first, second, third : array
         w, w', w'', w'''.
     ratio : array
-        `w'/|eta|`, at |eta| = 0 its limit w''.
+        `w'/|eta|`, at `|eta|` = 0 its limit w''.
     """
 
     value: Array
