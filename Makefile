@@ -7,6 +7,11 @@ TORCH ?= torch==2.13.0
 JOBS ?= 2
 CPU_BACKENDS ?= numpy,numpy:readonly,strict,strict:device1,torch:cpu
 GPU_BACKENDS ?= torch:cuda
+# JAX compiles every operation for every shape: its run takes the kernels, and the public
+# functions against NumPy, not every shape of every test.
+JAX_TESTS := $(addprefix tests/test_,arrays.py shear.py grid.py transform.py interpolation.py \
+  psf.py forms.py weights.py nulltests.py measure.py::test_libraries_agree \
+  population.py::test_a_ring_gives_its_shear)
 
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check
@@ -30,8 +35,8 @@ test: $(VENV)/.dev ## the test suite on the CPU, all libraries but JAX
 test-slow: $(VENV)/.dev ## the tests that take minutes
 	@FDNT_XP_TEST_BACKENDS=numpy,torch:cpu $(PYTEST) -n $(JOBS) -m slow
 
-test-jax: $(VENV)/.jax ## the quick tests on JAX
-	@FDNT_XP_TEST_BACKENDS=jax $(PYTEST) -n $(JOBS) -m "not slow and not science"
+test-jax: $(VENV)/.jax ## the kernels and the public functions on JAX
+	@FDNT_XP_TEST_BACKENDS=jax $(PYTEST) -n $(JOBS) $(JAX_TESTS)
 
 test-gpu: $(VENV)/.dev ## the test suite on the GPU (GPU_BACKENDS=torch:cuda,cupy)
 	@FDNT_XP_TEST_BACKENDS=$(GPU_BACKENDS) $(PYTEST)
