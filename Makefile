@@ -21,7 +21,7 @@ PYTEST := $(BIN)/python -m pytest --quiet
 export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow test-jax test-gpu bench lint docs clean
+.PHONY: help demo test test-jax test-gpu bench lint docs clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
@@ -31,9 +31,6 @@ demo: $(VENV)/.demo ## draw an image of known shear, measure it, write demo/
 
 test: $(VENV)/.dev ## the test suite on the CPU, all libraries but JAX
 	@FDNT_XP_TEST_BACKENDS=$(CPU_BACKENDS) $(PYTEST) -n $(JOBS)
-
-test-slow: $(VENV)/.dev ## the tests that take minutes
-	@FDNT_XP_TEST_BACKENDS=numpy,torch:cpu $(PYTEST) -n $(JOBS) -m slow
 
 test-jax: $(VENV)/.jax ## the kernels and the public functions on JAX
 	@FDNT_XP_TEST_BACKENDS=jax $(PYTEST) -n $(JOBS) $(JAX_TESTS)

@@ -3,6 +3,8 @@
 One code for NumPy, torch, JAX and CuPy: the arrays that are given decide where it runs.
 """
 
+from fdnt_xp.data.ring import RingResult as RingResult
+from fdnt_xp.data.ring import ring_test as ring_test
 from fdnt_xp.fourier.psf import Psf as Psf
 from fdnt_xp.shapes.measure import measure_shapes as measure_shapes
 from fdnt_xp.shapes.results import ShapeResult as ShapeResult
@@ -15,11 +17,13 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Psf",
+    "RingResult",
     "ShapeResult",
     "ShearEstimate",
     "__version__",
     "measure_shapes",
     "population_null",
+    "ring_test",
     "shear_from_shapes",
     "shear_from_stack",
 ]

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import j0
 
+from fdnt_xp.data.profiles import load_galsim
 from fdnt_xp.data.stamps import SMALLEST_STAMP
-from fdnt_xp.errors import FdntValueError, MissingExtraError, RangeError
+from fdnt_xp.errors import FdntValueError, RangeError
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -96,7 +97,7 @@ def great08_image(
     MissingExtraError
         If GalSim is not installed.
     """
-    galsim = _galsim()
+    galsim = load_galsim()
     n_gal = n_x * n_y
     _check(n_gal, cell, shear, snr)
     rng = np.random.default_rng(seed)
@@ -121,7 +122,7 @@ def great08_image(
 
 def great08_psf() -> Any:
     """Return the fiducial PSF of GREAT08 as a GalSim object, without the pixel."""
-    galsim = _galsim()
+    galsim = load_galsim()
     moffat = galsim.Moffat(
         beta=PSF_BETA,
         fwhm=PSF_FWHM,
@@ -149,7 +150,7 @@ def half_light_radius(sersic_n: float, size_ratio: float = SIZE_RATIO) -> float:
     float
         Pixels; 1.268 for an exponential and 3.016 for a de Vaucouleurs at a ratio of 1.4.
     """
-    galsim = _galsim()
+    galsim = load_galsim()
     fine = galsim.GSParams(kvalue_accuracy=1e-6)
     psf = galsim.Moffat(
         beta=PSF_BETA, fwhm=PSF_FWHM, trunc=PSF_TRUNCATION * PSF_FWHM, gsparams=fine
@@ -252,17 +253,6 @@ def _transform(profile: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 def _gsparams(galsim: ModuleType) -> Any:
     # The wings of an elongated de Vaucouleurs need transforms beyond GalSim's limit.
     return galsim.GSParams(folding_threshold=2e-3, maximum_fft_size=32768)
-
-
-def _galsim() -> ModuleType:
-    try:
-        import galsim
-    except ImportError as error:
-        raise MissingExtraError(
-            "simulated images need GalSim, which is not installed: pip install 'fdnt-xp[sim]'"
-        ) from error
-    module: ModuleType = galsim
-    return module
 
 
 def _check(n_gal: int, cell: int, shear: tuple[float, float], snr: float | None) -> None:
