@@ -7,11 +7,16 @@ right one. Under a fixed round weight the dipole alone is solved, from the stamp
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 from fdnt_xp.arrays import Array, array_namespace
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.transform import DeconvolvedStamps
 from fdnt_xp.nulltests.dogleg import DoglegOptions, find_root
+from fdnt_xp.nulltests.weights import Weight
+
+_WIDE: Final = 0.125
+"""Size of the weight of the first centroid, in sides of the stamp: it reaches a third of it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,3 +83,28 @@ def starting_centroid(
     found = length * find_root(problem, centre, options=options).x
     near = xp.abs(found) <= reach
     return xp.where((near[:, 0] & near[:, 1])[:, None], found, centre)
+
+
+def wide_weight(
+    weight: Weight, grid: KGrid, side: int, applied_shear: Array | None = None
+) -> Array:
+    """Return the weight of the first centroid, shape (n_psf, n_k).
+
+    Parameters
+    ----------
+    side : int
+        Shorter side of the stamps, pixels.
+    applied_shear : array, shape (2,), optional
+        Makes the weight round in the frame from which this eta is taken off: the null of
+        its dipole then follows that shear. By default it is round on the image.
+    """
+    xp = array_namespace(kmax=weight.kmax)
+    shrink = xp.ones_like(weight.kmax)
+    if applied_shear is not None:
+        grid = grid.sheared(applied_shear)
+        # As in the null tests: the weight may not reach out of the disc.
+        shrink = shrink * xp.exp(0.5 * xp.sqrt(xp.sum(applied_shear**2)))
+    radius_squared = (grid.kx**2 + grid.ky**2)[None, :]
+    square = xp.broadcast_to(radius_squared, (int(weight.kmax.shape[0]), grid.n_k))
+    psf_factor, _ = weight.psf_factor(square, shrink)
+    return psf_factor * xp.exp(-0.5 * (_WIDE * side) ** 2 * square)

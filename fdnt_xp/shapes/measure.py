@@ -10,7 +10,6 @@ stamps -> transform, divided by T        fourier
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from types import ModuleType
 from typing import Final
 
@@ -19,33 +18,30 @@ from fdnt_xp.arrays import (
     array_namespace,
     as_floating,
     compiles_every_shape,
-    device_of,
     require_dtype,
 )
-from fdnt_xp.errors import FdntTypeError, FdntValueError, RangeError, ShapeMismatchError
+from fdnt_xp.errors import RangeError, ShapeMismatchError
 from fdnt_xp.flags import Flag
-from fdnt_xp.fourier.grid import KGrid, half_plane_disc
+from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.psf import Psf
 from fdnt_xp.fourier.transform import deconvolve
 from fdnt_xp.nulltests.dogleg import DoglegOptions, RootResult, find_root
 from fdnt_xp.nulltests.tests import NullTests
-from fdnt_xp.nulltests.weights import Weight, make_weight
-from fdnt_xp.shapes.centroid import starting_centroid
+from fdnt_xp.shapes.centroid import starting_centroid, wide_weight
+from fdnt_xp.shapes.job import (
+    FINER,
+    Job,
+    check_options,
+    check_stamps,
+    galaxies_at_once,
+    prepare,
+    screen,
+)
 from fdnt_xp.shapes.results import ShapeResult
 from fdnt_xp.shapes.solution import describe
 
 _FINE_ABOVE: Final = 1.5
 """`|eta|` beyond which the weight, squeezed by `exp(-|eta|/2)`, covers few cells of the k grid."""
-_FINE: Final = 2
-"""How much finer the second grid is, along each axis."""
-_FEWEST_CELLS: Final = 3.0
-"""Least radius of the disc, in cells of the k grid: quadrupoles need an annulus or two."""
-_WIDE: Final = 0.125
-"""Size of the weight of the first centroid, in sides of the stamp: it reaches a third of it."""
-_BYTES_AT_ONCE: Final = 128e6
-"""Memory of a chunk of galaxies."""
-_FIELDS: Final = 24
-"""Arrays of the size of the deconvolved stamps that an evaluation of the tests holds."""
 
 
 def measure_shapes(
@@ -118,13 +114,9 @@ def measure_shapes(
     xp, stamps = check_stamps(stamps, psf)
     n_gal = int(stamps.shape[0])
     noise = _noise_column(xp, noise_variance, stamps)
-    for name, value, least in (("padding", padding, 1), ("max_iter", max_iter, 0)):
-        if value != int(value) or value < least:
-            raise RangeError(name, value, least, None)
-    if size is not None and not (math.isfinite(size) and size > 0):
-        raise RangeError("size", size, 0.0, None)
-    if chunk_size is not None and (chunk_size != int(chunk_size) or chunk_size < 1):
-        raise RangeError("chunk_size", chunk_size, 1, None)
+    check_options(size=size, padding=padding, chunk_size=chunk_size)
+    if max_iter != int(max_iter) or max_iter < 0:
+        raise RangeError("max_iter", max_iter, 0, None)
     if n_gal == 0:
         return ShapeResult.unmeasured(stamps)
 
@@ -135,67 +127,6 @@ def measure_shapes(
         rows = slice(start, min(start + n_chunk, n_gal))
         parts.append(_measure_chunk(job.rows(rows), stamps[rows, :, :], noise[rows]))
     return ShapeResult.concat(parts)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Job:
-    """What all galaxies share, and the PSF, of which there may be one for each."""
-
-    psf: Psf
-    weight: Weight
-    coarse: KGrid
-    fine: KGrid
-    length: float
-    size: float | None
-    max_iter: int
-
-    def rows(self, rows: slice) -> Job:
-        """Return the job of a range of galaxies."""
-        if self.weight.shared:
-            return self
-        xp = array_namespace(kmax=self.psf.kmax)
-        device = device_of(self.psf.kmax)
-        return self.take(xp.arange(rows.start, rows.stop, dtype=xp.int64, device=device))
-
-    def take(self, rows: Array) -> Job:
-        """Return the job of the given galaxies (integer array)."""
-        if self.weight.shared:
-            return self
-        return Job(
-            psf=self.psf.take(rows),
-            weight=self.weight.take(rows),
-            coarse=self.coarse,
-            fine=self.fine,
-            length=self.length,
-            size=self.size,
-            max_iter=self.max_iter,
-        )
-
-
-def prepare(
-    xp: ModuleType, stamps: Array, psf: Psf, padding: int, size: float | None, max_iter: int
-) -> Job:
-    """Make the k grids and the tables of the weight."""
-    ny, nx = (int(n) for n in stamps.shape[1:])
-    shape = (padding * ny, padding * nx)
-    cell = 2.0 * math.pi / min(ny, nx)
-    if psf.largest_kmax < _FEWEST_CELLS * cell:
-        raise FdntValueError(
-            f"psf is too wide for stamps of {ny} x {nx} pixels: its transfer function ends at "
-            f"{psf.largest_kmax:.3g} rad/pixel, and {_FEWEST_CELLS * cell:.3g} is the least that "
-            "such stamps resolve"
-        )
-    like = {"dtype": stamps.dtype, "device": device_of(stamps)}
-    return Job(
-        psf=psf.restricted(_FEWEST_CELLS * cell),
-        # A weight of this size is one cell of the k grid wide.
-        weight=make_weight(psf, largest_size=1.0 / cell),
-        coarse=half_plane_disc(xp, shape, psf.largest_kmax, **like),
-        fine=half_plane_disc(xp, (_FINE * shape[0], _FINE * shape[1]), psf.largest_kmax, **like),
-        length=3.0 / psf.largest_kmax,  # about the size of the PSF
-        size=size,
-        max_iter=max_iter,
-    )
 
 
 def _measure_chunk(job: Job, stamps: Array, noise: Array) -> ShapeResult:
@@ -212,7 +143,7 @@ def _measure_chunk(job: Job, stamps: Array, noise: Array) -> ShapeResult:
         return result
     order = xp.argsort(xp.astype(~finer, xp.int32), stable=True)
     parts = []
-    per_chunk = max(1, int(stamps.shape[0]) // _FINE**2)
+    per_chunk = max(1, int(stamps.shape[0]) // FINER**2)
     for start in range(0, n_fine, per_chunk):
         rows = order[start : min(start + per_chunk, n_fine)]
         again, _ = _measure_on(
@@ -225,30 +156,6 @@ def _measure_chunk(job: Job, stamps: Array, noise: Array) -> ShapeResult:
         parts.append(again)
     merged = ShapeResult.concat([*parts, result.take(order[n_fine:])])
     return merged.take(xp.argsort(order))
-
-
-def screen(stamps: Array, psf: Psf) -> tuple[Array, Array]:
-    """Return stamps that do no harm, zero where not finite, and why some cannot be measured.
-
-    Returns
-    -------
-    stamps : array, shape (n_gal, ny, nx)
-    flags : array, shape (n_gal,), int32
-        Zero, or a reason of `fdnt_xp.flags.Flag`.
-    """
-    xp = array_namespace(stamps=stamps)
-    finite = xp.all(xp.all(xp.isfinite(stamps), axis=-1), axis=-1)
-    stamps = xp.where(finite[:, None, None], stamps, xp.zeros_like(stamps))
-    brightest = xp.max(xp.max(stamps, axis=-1), axis=-1)
-    faintest = xp.min(xp.min(stamps, axis=-1), axis=-1)
-    flags = xp.zeros_like(brightest, dtype=xp.int32)
-    for reason, holds in (
-        (Flag.NON_FINITE_PIXEL, ~finite),
-        (Flag.NO_SIGNAL, finite & (brightest == faintest)),
-        (Flag.BAD_PSF, xp.broadcast_to(~psf.usable, finite.shape)),
-    ):
-        flags = flags + xp.astype(holds, xp.int32) * int(reason)
-    return stamps, flags
 
 
 def _measure_on(
@@ -297,52 +204,6 @@ def solve(job: Job, tests: NullTests, side: int) -> RootResult:
     return find_root(tests, start, options=options)
 
 
-def wide_weight(
-    weight: Weight, grid: KGrid, side: int, applied_shear: Array | None = None
-) -> Array:
-    """Return the weight of the first centroid, shape (n_psf, n_k).
-
-    Parameters
-    ----------
-    side : int
-        Shorter side of the stamps, pixels.
-    applied_shear : array, shape (2,), optional
-        Makes the weight round in the frame from which this eta is taken off: the null of
-        its dipole then follows that shear. By default it is round on the image.
-    """
-    xp = array_namespace(kmax=weight.kmax)
-    shrink = xp.ones_like(weight.kmax)
-    if applied_shear is not None:
-        grid = grid.sheared(applied_shear)
-        # As in the null tests: the weight may not reach out of the disc.
-        shrink = shrink * xp.exp(0.5 * xp.sqrt(xp.sum(applied_shear**2)))
-    radius_squared = (grid.kx**2 + grid.ky**2)[None, :]
-    square = xp.broadcast_to(radius_squared, (int(weight.kmax.shape[0]), grid.n_k))
-    psf_factor, _ = weight.psf_factor(square, shrink)
-    return psf_factor * xp.exp(-0.5 * (_WIDE * side) ** 2 * square)
-
-
-def check_stamps(stamps: Array, psf: Psf) -> tuple[ModuleType, Array]:
-    """Refuse what cannot be measured; return the namespace and the stamps as floats."""
-    if not isinstance(psf, Psf):
-        raise FdntTypeError(
-            f"psf must be a Psf, not {type(psf).__name__}; make one with Psf.from_image"
-        )
-    xp = array_namespace(stamps=stamps, psf=psf.image)
-    stamps = as_floating(xp, stamps, "stamps")
-    require_dtype(stamps.dtype, psf=psf.image)
-    if stamps.ndim != 3 or 0 in stamps.shape[1:]:
-        raise ShapeMismatchError(
-            f"stamps must have the shape (n_gal, ny, nx), not {tuple(stamps.shape)}"
-        )
-    n_gal = int(stamps.shape[0])
-    if psf.n_psf not in (1, n_gal):
-        raise ShapeMismatchError(
-            f"psf holds {psf.n_psf} PSFs for {n_gal} stamps; it must hold one, or one for each"
-        )
-    return xp, stamps
-
-
 def _noise_column(xp: ModuleType, noise_variance: float | Array | None, stamps: Array) -> Array:
     """Return the noise variance of each galaxy, NaN where unknown; shape (n_gal,)."""
     like = stamps[:, 0, 0]
@@ -361,10 +222,3 @@ def _noise_column(xp: ModuleType, noise_variance: float | Array | None, stamps: 
             f"not {tuple(noise.shape)}"
         )
     return xp.broadcast_to(noise, like.shape)
-
-
-def galaxies_at_once(grid: KGrid, stamps: Array) -> int:
-    """Return how many galaxies fit the memory of a chunk."""
-    ny, nx = stamps.shape[1:]
-    numbers = _FIELDS * grid.n_k + 3 * int(ny) * int(nx)
-    return max(16, int(_BYTES_AT_ONCE / (numbers * 8)))

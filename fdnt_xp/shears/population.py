@@ -18,14 +18,14 @@ from fdnt_xp.arrays import Array, array_namespace, device_of
 from fdnt_xp.errors import FdntValueError, RangeError
 from fdnt_xp.fourier.psf import Psf
 from fdnt_xp.fourier.transform import deconvolve
-from fdnt_xp.shapes.centroid import starting_centroid
-from fdnt_xp.shapes.measure import (
+from fdnt_xp.shapes.centroid import starting_centroid, wide_weight
+from fdnt_xp.shapes.job import (
     Job,
+    check_options,
     check_stamps,
     galaxies_at_once,
     prepare,
     screen,
-    wide_weight,
 )
 from fdnt_xp.shear import reduced_shear_from_eta
 from fdnt_xp.shears.counter_shear import (
@@ -111,7 +111,9 @@ def population_null(
     result by about `4/(S/N)²` (relative).
     """
     xp, stamps = check_stamps(stamps, psf)
-    _check_numbers(max_shear, size, padding, chunk_size)
+    check_options(size=size, padding=padding, chunk_size=chunk_size)
+    if not 0.0 < max_shear <= _LARGEST_SHEAR:
+        raise RangeError("max_shear", max_shear, 0.0, _LARGEST_SHEAR)
     if statistic not in ("frozen", "eta"):
         raise FdntValueError(f'statistic must be "frozen" or "eta", not {statistic!r}')
     if weight is not None and statistic == "frozen":
@@ -313,16 +315,3 @@ def _solve_pair(xp: ModuleType, matrix: Array, vector: Array) -> Array:
 
 def _pair(vector: Array) -> tuple[float, float]:
     return float(vector[0]), float(vector[1])
-
-
-def _check_numbers(
-    max_shear: float, size: float | None, padding: int, chunk_size: int | None
-) -> None:
-    if not 0.0 < max_shear <= _LARGEST_SHEAR:
-        raise RangeError("max_shear", max_shear, 0.0, _LARGEST_SHEAR)
-    if size is not None and not (math.isfinite(size) and size > 0):
-        raise RangeError("size", size, 0.0, None)
-    if padding != int(padding) or padding < 1:
-        raise RangeError("padding", padding, 1, None)
-    if chunk_size is not None and (chunk_size != int(chunk_size) or chunk_size < 1):
-        raise RangeError("chunk_size", chunk_size, 1, None)

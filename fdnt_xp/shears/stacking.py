@@ -24,16 +24,9 @@ from fdnt_xp.fourier.transform import DeconvolvedStamps, deconvolve
 from fdnt_xp.nulltests.dogleg import DoglegOptions, find_root
 from fdnt_xp.nulltests.tests import NullTests
 from fdnt_xp.nulltests.weights import Weight
-from fdnt_xp.shapes.centroid import DipoleTests, starting_centroid
-from fdnt_xp.shapes.measure import (
-    Job,
-    check_stamps,
-    galaxies_at_once,
-    prepare,
-    screen,
-    solve,
-    wide_weight,
-)
+from fdnt_xp.shapes.centroid import DipoleTests, starting_centroid, wide_weight
+from fdnt_xp.shapes.job import Job, check_stamps, galaxies_at_once, prepare, screen
+from fdnt_xp.shapes.measure import solve
 from fdnt_xp.shapes.results import ShapeResult
 from fdnt_xp.shapes.solution import describe
 from fdnt_xp.shear import reduced_shear_from_eta

@@ -1,0 +1,153 @@
+"""What every measurement of a batch begins with: checks, k grids, tables, chunks."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from types import ModuleType
+from typing import Final
+
+from fdnt_xp.arrays import Array, array_namespace, as_floating, device_of, require_dtype
+from fdnt_xp.errors import FdntTypeError, FdntValueError, RangeError, ShapeMismatchError
+from fdnt_xp.flags import Flag
+from fdnt_xp.fourier.grid import KGrid, half_plane_disc
+from fdnt_xp.fourier.psf import Psf
+from fdnt_xp.nulltests.weights import Weight, make_weight
+
+FINER: Final = 2
+"""How much finer the grid for elongated galaxies is, along each axis."""
+_FEWEST_CELLS: Final = 3.0
+"""Least radius of the disc, in cells of the k grid: quadrupoles need an annulus or two."""
+_BYTES_AT_ONCE: Final = 128e6
+"""Memory of a chunk of galaxies."""
+_FIELDS: Final = 24
+"""Arrays of the size of the deconvolved stamps that an evaluation of the tests holds."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """What all galaxies of a call share, and the PSF, of which there may be one for each.
+
+    Parameters
+    ----------
+    psf : Psf
+    weight : Weight
+        Of each PSF.
+    coarse, fine : KGrid
+        The grid of the stamps, and one `FINER` times finer.
+    length : float
+        Unit of centroids, pixels: about the size of the PSF.
+    size : float or None
+        Fixed size of the weight, pixels.
+    max_iter : int
+        Steps of the root finder.
+    """
+
+    psf: Psf
+    weight: Weight
+    coarse: KGrid
+    fine: KGrid
+    length: float
+    size: float | None
+    max_iter: int
+
+    def rows(self, rows: slice) -> Job:
+        """Return the job of a range of galaxies."""
+        if self.weight.shared:
+            return self
+        xp = array_namespace(kmax=self.psf.kmax)
+        device = device_of(self.psf.kmax)
+        return self.take(xp.arange(rows.start, rows.stop, dtype=xp.int64, device=device))
+
+    def take(self, rows: Array) -> Job:
+        """Return the job of the given galaxies (integer array)."""
+        if self.weight.shared:
+            return self
+        return replace(self, psf=self.psf.take(rows), weight=self.weight.take(rows))
+
+
+def check_stamps(stamps: Array, psf: Psf) -> tuple[ModuleType, Array]:
+    """Refuse what cannot be measured; return the namespace and the stamps as floats."""
+    if not isinstance(psf, Psf):
+        raise FdntTypeError(
+            f"psf must be a Psf, not {type(psf).__name__}; make one with Psf.from_image"
+        )
+    xp = array_namespace(stamps=stamps, psf=psf.image)
+    stamps = as_floating(xp, stamps, "stamps")
+    require_dtype(stamps.dtype, psf=psf.image)
+    if stamps.ndim != 3 or 0 in stamps.shape[1:]:
+        raise ShapeMismatchError(
+            f"stamps must have the shape (n_gal, ny, nx), not {tuple(stamps.shape)}"
+        )
+    n_gal = int(stamps.shape[0])
+    if psf.n_psf not in (1, n_gal):
+        raise ShapeMismatchError(
+            f"psf holds {psf.n_psf} PSFs for {n_gal} stamps; it must hold one, or one for each"
+        )
+    return xp, stamps
+
+
+def check_options(*, size: float | None, padding: int, chunk_size: int | None) -> None:
+    """Refuse numbers that mean nothing."""
+    if size is not None and not (math.isfinite(size) and size > 0):
+        raise RangeError("size", size, 0.0, None)
+    for name, value in (("padding", padding), ("chunk_size", chunk_size)):
+        if value is not None and (value != int(value) or value < 1):
+            raise RangeError(name, value, 1, None)
+
+
+def prepare(
+    xp: ModuleType, stamps: Array, psf: Psf, padding: int, size: float | None, max_iter: int
+) -> Job:
+    """Make the k grids and the tables of the weight."""
+    ny, nx = (int(n) for n in stamps.shape[1:])
+    shape = (padding * ny, padding * nx)
+    cell = 2.0 * math.pi / min(ny, nx)
+    if psf.largest_kmax < _FEWEST_CELLS * cell:
+        raise FdntValueError(
+            f"psf is too wide for stamps of {ny} x {nx} pixels: its transfer function ends at "
+            f"{psf.largest_kmax:.3g} rad/pixel, and {_FEWEST_CELLS * cell:.3g} is the least that "
+            "such stamps resolve"
+        )
+    like = {"dtype": stamps.dtype, "device": device_of(stamps)}
+    return Job(
+        psf=psf.restricted(_FEWEST_CELLS * cell),
+        # A weight of this size is one cell of the k grid wide.
+        weight=make_weight(psf, largest_size=1.0 / cell),
+        coarse=half_plane_disc(xp, shape, psf.largest_kmax, **like),
+        fine=half_plane_disc(xp, (FINER * shape[0], FINER * shape[1]), psf.largest_kmax, **like),
+        length=3.0 / psf.largest_kmax,
+        size=size,
+        max_iter=max_iter,
+    )
+
+
+def screen(stamps: Array, psf: Psf) -> tuple[Array, Array]:
+    """Return stamps that do no harm, zero where not finite, and why some cannot be measured.
+
+    Returns
+    -------
+    stamps : array, shape (n_gal, ny, nx)
+    flags : array, shape (n_gal,), int32
+        Zero, or a reason of `fdnt_xp.flags.Flag`.
+    """
+    xp = array_namespace(stamps=stamps)
+    finite = xp.all(xp.all(xp.isfinite(stamps), axis=-1), axis=-1)
+    stamps = xp.where(finite[:, None, None], stamps, xp.zeros_like(stamps))
+    brightest = xp.max(xp.max(stamps, axis=-1), axis=-1)
+    faintest = xp.min(xp.min(stamps, axis=-1), axis=-1)
+    flags = xp.zeros_like(brightest, dtype=xp.int32)
+    for reason, holds in (
+        (Flag.NON_FINITE_PIXEL, ~finite),
+        (Flag.NO_SIGNAL, finite & (brightest == faintest)),
+        (Flag.BAD_PSF, xp.broadcast_to(~psf.usable, finite.shape)),
+    ):
+        flags = flags + xp.astype(holds, xp.int32) * int(reason)
+    return stamps, flags
+
+
+def galaxies_at_once(grid: KGrid, stamps: Array) -> int:
+    """Return how many galaxies fit the memory of a chunk."""
+    ny, nx = stamps.shape[1:]
+    numbers = _FIELDS * grid.n_k + 3 * int(ny) * int(nx)
+    return max(16, int(_BYTES_AT_ONCE / (numbers * 8)))
