@@ -12,7 +12,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from array_api_extra.testing import assert_close
-from images import gaussian_covariance, gaussian_image
 from scipy.linalg import expm
 
 from fdnt_xp.fourier.grid import half_plane_disc
@@ -20,6 +19,7 @@ from fdnt_xp.fourier.psf import Psf
 from fdnt_xp.fourier.transform import deconvolve
 from fdnt_xp.nulltests.tests import NullTests
 from fdnt_xp.nulltests.weights import make_weight
+from images import gaussian_covariance, gaussian_image
 from tolerances import tolerance
 
 SHAPE = (30, 33)
@@ -443,7 +443,9 @@ def test_a_free_width_has_noise_of_its_own(dtype, make_tests, to_xp, to_np):
     width = to_np(free.at(eta, x0)[1].width)
     held, _ = make_tests(fixed=width)
     ours, theirs = (to_np(t.noise(eta, x0, inverse_power).even) for t in (free, held))
-    ratio = np.diagonal(ours - theirs, axis1=1, axis2=2) / np.trace(theirs, axis1=1, axis2=2)[:, None]
+    ratio = (
+        np.diagonal(ours - theirs, axis1=1, axis2=2) / np.trace(theirs, axis1=1, axis2=2)[:, None]
+    )
     assert np.max(np.abs(ratio[[0, 3]])) > 0.05
     np.testing.assert_allclose(ratio[2], 0.0, atol=1e-6)  # at its bound the width is still
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from array_api_extra.testing import assert_close, assert_equal
-from images import gaussian_covariance, gaussian_image
 from scipy.integrate import quad
 from scipy.optimize import brentq
 from scipy.special import i0e, j0
@@ -14,6 +13,7 @@ from fdnt_xp.errors import FdntTypeError, FdntValueError, RangeError, ShapeMisma
 from fdnt_xp.fourier import psf as psf_module
 from fdnt_xp.fourier.grid import half_plane_disc
 from fdnt_xp.fourier.psf import Psf
+from images import gaussian_covariance, gaussian_image
 from tolerances import tolerance
 
 FLOOR = 1e-3
@@ -279,9 +279,9 @@ def test_restricted_marks_what_ends_too_early(three, to_np):
 BAD = {
     "zero": 0.0 * ROUND,
     "negative": -ROUND,
-    "NaN": np.where(ROUND == ROUND.max(), np.nan, ROUND),
-    "infinite": np.where(ROUND == ROUND.max(), np.inf, ROUND),
-    "both infinities": np.where(ROUND == ROUND.max(), np.inf, -np.inf),
+    "NaN": np.where(ROUND.max() == ROUND, np.nan, ROUND),
+    "infinite": np.where(ROUND.max() == ROUND, np.inf, ROUND),
+    "both infinities": np.where(ROUND.max() == ROUND, np.inf, -np.inf),
 }
 
 

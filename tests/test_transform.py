@@ -7,7 +7,6 @@ import pytest
 from array_api_extra.testing import assert_close, assert_equal
 from hypothesis import given
 from hypothesis import strategies as st
-from images import gaussian_covariance, gaussian_image
 
 from fdnt_xp.fourier.grid import half_plane_disc
 from fdnt_xp.fourier.transform import (
@@ -17,6 +16,7 @@ from fdnt_xp.fourier.transform import (
     half_plane_axes,
     mode_phase,
 )
+from images import gaussian_covariance, gaussian_image
 from tolerances import tolerance
 
 KMAX = 2.6

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from array_api_extra.testing import assert_close, assert_equal
-from images import gaussian_covariance, gaussian_image
 from scipy.integrate import quad
 
 from fdnt_xp.fourier.psf import Psf
 from fdnt_xp.nulltests.weights import make_weight
+from images import gaussian_covariance, gaussian_image
 from tolerances import tolerance
 
 FLOOR = 1e-2
@@ -44,7 +44,9 @@ def mean_powers(width, shrink, sigma, kmax):
 
     def moment(n):
         def integrand(k):
-            return k ** (n + 1) * circular_power(shrink * k, sigma, kmax) * np.exp(-0.5 * k**2 * width)
+            return (
+                k ** (n + 1) * circular_power(shrink * k, sigma, kmax) * np.exp(-0.5 * k**2 * width)
+            )
 
         return quad(integrand, 0.0, kmax / shrink, epsabs=0.0, epsrel=1e-11, limit=200)[0]
 
@@ -174,9 +176,7 @@ def test_slope_of_the_matched_width_is_its_derivative():
     weight = make_weight(Psf.from_image(STARS[0], floor=FLOOR), LARGEST)
     inverse, h = np.linspace(4.2, 10.0, 31), 1e-6
     shrink = np.full(31, 1.2)
-    (above, _, bound), (below, _, _) = (
-        weight.matched_width(inverse + d, shrink) for d in (h, -h)
-    )
+    (above, _, bound), (below, _, _) = (weight.matched_width(inverse + d, shrink) for d in (h, -h))
     assert not bound.any()
     numeric = (above - below) / (2.0 * h)
     np.testing.assert_allclose(weight.matched_width(inverse, shrink)[1], numeric, rtol=1e-7)

@@ -35,7 +35,7 @@ from fdnt_xp.shears.weights import count_true, galaxy_weights
 
 _MAX_ITER: Final = 50
 _PASSES: Final = 8
-"""At most; each gains a factor of 30 or more, and one is enough for symmetric galaxies."""
+"""At most; each gains a factor of 50 or more, and one is enough for symmetric galaxies."""
 _MOVED_LEAST: Final = {False: 1e-9, True: 1e-5}
 """Change of eta that ends the passes, in float64 and (True) in float32."""
 
