@@ -47,7 +47,7 @@ def result(eta, to_xp=np.asarray, dtype="float64", *, eg=None, cov=None, flags=N
 # --- the shear comes back ------------------------------------------------------------
 
 
-@pytest.mark.parametrize("weight", WEIGHTS, ids=str)
+@pytest.mark.parametrize("weight", WEIGHTS, ids=["uniform", "gaussian", "lorentzian"])
 def test_exact_to_fifth_order(weight):
     direction = vector(1.0, 2.1)
     error = [
@@ -60,7 +60,7 @@ def test_exact_to_fifth_order(weight):
     np.testing.assert_allclose([error[1] / error[0], error[2] / error[1]], 32.0, rtol=0.1)
 
 
-@pytest.mark.parametrize("weight", WEIGHTS, ids=str)
+@pytest.mark.parametrize("weight", WEIGHTS, ids=["uniform", "gaussian", "lorentzian"])
 def test_the_linear_estimate_is_off_by_the_cube(weight):
     g = np.array([0.03, 0.04])
     linear = fx.shear_from_shapes(result(lensed(g)), weight, cubic=False)
