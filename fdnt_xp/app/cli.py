@@ -14,8 +14,10 @@ import click
 import fdnt_xp
 from fdnt_xp.app.backends import BACKENDS, DTYPES
 from fdnt_xp.app.demo import Field, run_demo
+from fdnt_xp.app.gradient_figure import GradientFigure, draw_gradient_figure
 from fdnt_xp.app.measure import Inputs, Settings, measure_files
 from fdnt_xp.app.plots import check_figure, plot_catalog, save_figure
+from fdnt_xp.app.ring import RingOptions, run_ring
 from fdnt_xp.app.summary import summary_lines
 from fdnt_xp.data.catalog import check_catalog, read_catalog, write_catalog
 from fdnt_xp.errors import FdntError, FdntWarning
@@ -74,7 +76,7 @@ def _options(*decorators: Callable[[_F], _F]) -> Callable[[_F], _F]:
     return decorate
 
 
-_HOW = _options(
+_WHERE = _options(
     click.option(
         "--backend",
         type=click.Choice(list(BACKENDS)),
@@ -90,6 +92,9 @@ _HOW = _options(
         show_default=True,
         help="Precision.",
     ),
+)
+_HOW = _options(
+    _WHERE,
     click.option(
         "--oversampling",
         type=click.IntRange(min=1),
@@ -268,3 +273,66 @@ def demo(
             click.echo(line)
 
     run_demo(Path(output), field, inputs, settings, overwrite=overwrite, say=say)
+
+
+@main.command(cls=_Command)
+@click.option(
+    "--galaxy",
+    default="vb-spiral",
+    show_default=True,
+    metavar="GALAXY",
+    help="vb-spiral, orthogonal, torture, or sersic:N,HLR,E.",
+)
+@click.option(
+    "--psf",
+    default="gaussian:2,0.1,0.05",
+    show_default=True,
+    metavar="PSF",
+    help="gaussian:HLR,E1,E2 or moffat:BETA,FWHM,E1,E2.",
+)
+@click.option("--delta-eta", type=float, default=0.02, show_default=True, help="Applied, along x.")
+@click.option("--angles", type=int, default=16, show_default=True, help="Angles over half a turn.")
+@click.option("--stamp", type=int, default=128, show_default=True, help="Pixels on a side.")
+@click.option("--padding", type=int, default=1, show_default=True, help="Makes the k grid finer.")
+@click.option("--pixel", is_flag=True, help="Draw the pixel in addition to the PSF.")
+@click.option("--method", default="fdnt-ft", show_default=True, help="Shape method.")
+@click.option("-o", "--output", metavar="JSON", help="Result to write: .json.")
+@click.option("--plot", "figure", metavar="FIGURE", help="Plot to write: .png, .pdf or .svg.")
+@_WHERE
+@_OVERWRITE
+def ring(output: str | None, figure: str | None, overwrite: bool, **options: Any) -> None:
+    """Turn a galaxy through all angles, shear it, and see what shear comes back.
+
+    Prints the multiplicative and additive bias of each estimator of shear. Lengths are in
+    pixels, shapes are distortions (a^2-b^2)/(a^2+b^2), the shear is conformal (eta).
+    """
+    for line in run_ring(RingOptions(**options), output, figure, overwrite=overwrite):
+        click.echo(line)
+
+
+@main.group(name="figure")
+def figures() -> None:
+    """Draw the figures of the documentation, from nothing."""
+
+
+@figures.command(name="ellipticity-gradient", cls=_Command)
+@click.option(
+    "-o",
+    "--output",
+    default="ellipticity-gradient.png",
+    show_default=True,
+    metavar="FIGURE",
+    help=".png, .pdf or .svg.",
+)
+@click.option("--table", metavar="TABLE", help="Numbers to write: .json, .ecsv, .fits, .parquet.")
+@click.option("--delta-eta", type=float, default=0.02, show_default=True, help="Applied, along x.")
+@click.option("--points", type=click.IntRange(min=2), default=9, show_default=True, help="PSFs.")
+@click.option("--angles", type=int, default=16, show_default=True, help="Angles over half a turn.")
+@click.option("--stamp", type=int, default=192, show_default=True, help="Pixels on a side.")
+@click.option("--padding", type=int, default=2, show_default=True, help="Makes the k grid finer.")
+@_WHERE
+@_OVERWRITE
+def ellipticity_gradient(output: str, table: str | None, overwrite: bool, **options: Any) -> None:
+    """Ring tests of the three galaxies of Bernstein 2010, against the size of the PSF."""
+    figure = GradientFigure(**options)
+    draw_gradient_figure(figure, output, table, overwrite=overwrite, say=click.echo)

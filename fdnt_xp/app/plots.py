@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -31,6 +33,9 @@ GREEN: Final = "#009E73"
 INK: Final = "#333333"
 PALE: Final = "#B5B5B5"
 
+_NO_MATPLOTLIB: Final = (
+    "figures need matplotlib, which is not installed: pip install 'fdnt-xp[plot]'"
+)
 FORMATS: Final = (".png", ".pdf", ".svg")
 NEEDED: Final = ("x", "y", "x_image", "y_image", "e1", "e2", "snr", "flags")
 _MOST_WHISKERS: Final = 400
@@ -74,22 +79,13 @@ def plot_catalog(table: Table, title: str | None = None) -> Figure:
     MissingExtraError
         If matplotlib is not installed.
     """
-    try:
-        import matplotlib
-        from matplotlib.figure import Figure
-        from matplotlib.layout_engine import ConstrainedLayoutEngine
-    except ImportError as error:
-        raise MissingExtraError(
-            "figures need matplotlib, which is not installed: pip install 'fdnt-xp[plot]'"
-        ) from error
     if missing := [name for name in NEEDED if name not in table.colnames]:
         raise CatalogError(
             f"this is no catalog of fdnt-xp measure: it has no column {', '.join(missing)}"
         )
     good = table[measured_rows(table)]
-    with matplotlib.rc_context(_STYLE):
-        layout = ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.12)
-        figure = Figure(figsize=(13.5, 11.5), layout=layout, facecolor="white")
+    with page_style():
+        figure = new_figure(13.5, 11.5)
         panels = [["map", "map", "e"], ["map", "map", "abs"], ["flags", "centroid", "snr"]]
         axes: dict[str, Axes] = figure.subplot_mosaic(panels)
         figure.suptitle(_headline(table, good, title), x=0.015, ha="left", fontsize=13)
@@ -100,6 +96,26 @@ def plot_catalog(table: Table, title: str | None = None) -> Figure:
         _draw_centroids(axes["centroid"], good)
         _draw_snr(axes["snr"], good)
     return figure
+
+
+@contextmanager
+def page_style() -> Iterator[None]:
+    """Draw in the style of the house; `MissingExtraError` without matplotlib."""
+    try:
+        import matplotlib
+    except ImportError as error:
+        raise MissingExtraError(_NO_MATPLOTLIB) from error
+    with matplotlib.rc_context(_STYLE):
+        yield
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty white page of so many inches, with no tie to pyplot."""
+    from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+    layout = ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.12)
+    return Figure(figsize=(width, height), layout=layout, facecolor="white")
 
 
 def save_figure(figure: Figure, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:

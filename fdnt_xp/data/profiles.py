@@ -91,11 +91,10 @@ def irregular(
         n_knots,
         profile=galsim.Exponential(half_light_radius=half_light_radius),
         rng=galsim.BaseDeviate(seed),
-        flux=knot_flux,
         gsparams=accurate(galsim),
     )
     disc = sersic(1.0, half_light_radius, (0.3, 0.0), 1.0 - knot_flux)
-    return disc + knots.shear(e1=0.3, e2=0.0)
+    return disc + knots.withFlux(knot_flux).shear(e1=0.3, e2=0.0)
 
 
 TEST_GALAXIES: Final[dict[str, Callable[[], Any]]] = {

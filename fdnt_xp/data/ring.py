@@ -218,16 +218,16 @@ def ring_test(
     measure = shape_method(method)
     full_turn = not is_inversion_symmetric(galaxy)
     angles = ring_angles(n_angles, full_turn=full_turn)
-    shears = [(sign * applied[0], sign * applied[1]) for sign in (1.0, 0.0, -1.0)]
-    drawn = np.concatenate(
-        [draw_ring(galaxy, psf, angles, s, stamp_size=stamp_size, pixel=pixel) for s in shears]
-    )
-    star = draw(psf, stamp_size, pixel=pixel)
-    stamps, psf_array = to_array(drawn), Psf.from_image(to_array(star))
-    shapes = measure(stamps, psf_array, padding=padding, chunk_size=chunk_size)
+    drawn = [
+        draw_ring(galaxy, psf, angles, eta, stamp_size=stamp_size, pixel=pixel)
+        for eta in (applied, (0.0, 0.0), (-applied[0], -applied[1]))
+    ]
+    stamps = to_array(np.concatenate(drawn))
+    star = Psf.from_image(to_array(draw(psf, stamp_size, pixel=pixel)))
+    shapes = measure(stamps, star, padding=padding, chunk_size=chunk_size)
     rings = _Rings(
         stamps=stamps,
-        psf=psf_array,
+        psf=star,
         shapes=shapes,
         n_gal=len(angles),
         max_shear=max(max_shear, 1.2 * math.tanh(0.5 * math.hypot(*applied))),
@@ -254,7 +254,7 @@ def ring_test(
 def ring_angles(n_angles: int, *, full_turn: bool) -> NDArray[np.float64]:
     """Return the angles of a ring, radians: `n_angles` over pi, or twice that over 2 pi."""
     n = 2 * n_angles if full_turn else n_angles
-    return np.arange(n) * (np.pi / n_angles)
+    return np.arange(n, dtype=np.float64) * float(np.pi / n_angles)
 
 
 def draw_ring(
@@ -323,7 +323,7 @@ class _Rings:
             found = shear_from_shapes(
                 self.shapes_of(ring, start, step), use_eg=name != "raw", cubic=name == "eg+cubic"
             )
-        return np.asarray(to_numpy(found.g), dtype=np.float64)
+        return np.array([float(found.g[0]), float(found.g[1])])
 
 
 def _bias(rings: _Rings, name: str, applied: tuple[float, float], *, errors: bool) -> Bias:
