@@ -255,6 +255,19 @@ def test_smooth_at_zero(size, xp, dtype, to_xp):
         assert_close(actual, to_xp([float(exact)], dtype), rtol=rtol, xp=xp)
 
 
+@pytest.mark.parametrize("size", [1e-30, 1e-5, 0.3, 0.99, 1.01, 2.0, 4.0])
+def test_slopes_keep_their_digits(size, xp, dtype, to_xp):
+    # d/dx over x of the sums above: sum 2n x^(2n-2) / (2n + 1)! and / (2n + 2)!, n >= 1.
+    square = Fraction(size) ** 2
+    rtol = 40.0 * float(xp.finfo(dtype).eps)
+    computed = shear.hyperbolic_slopes(xp, to_xp([size], dtype) ** 2)
+    for offset, actual in zip((1, 2), computed, strict=True):
+        exact = sum(
+            2 * n * square ** (n - 1) / math.factorial(2 * n + offset) for n in range(1, 30)
+        )
+        assert_close(actual, to_xp([float(exact)], dtype), rtol=rtol, xp=xp)
+
+
 @pytest.mark.parametrize("size", [1e-9, 1e-30, 1e-200])
 def test_small_shears_keep_their_digits(size, xp, dtype, to_xp):
     # Down to where their squares underflow.

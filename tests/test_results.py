@@ -1,0 +1,98 @@
+"""`ShapeResult`: one row for each galaxy, in the library it was asked in."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+from array_api_extra.testing import assert_close, assert_equal
+
+import fdnt_xp as fx
+from fdnt_xp.flags import FAILED, Flag
+from fdnt_xp.shapes.results import COLUMNS
+from tolerances import tolerance
+
+ETA = np.array([[0.0, 0.0], [0.6, -0.3], [np.nan, np.nan]])
+
+
+@pytest.fixture
+def shapes(to_xp, dtype):
+    def column(values):
+        return to_xp(np.array(values, dtype=float), dtype)
+
+    def code(values):
+        return to_xp(np.array(values), "int32")
+
+    return fx.ShapeResult(
+        eta=column(ETA),
+        eta_cov=column(np.arange(12.0).reshape(3, 2, 2)),
+        eg=column([0.0, 0.1, np.nan]),
+        centroid=column([[1.0, 2.0], [3.0, 4.0], [np.nan, np.nan]]),
+        size=column([1.5, 2.5, np.nan]),
+        flux=column([10.0, 20.0, np.nan]),
+        snr=column([100.0, 200.0, np.nan]),
+        flags=code([0, int(Flag.SIZE_AT_BOUND), int(Flag.NO_SIGNAL)]),
+        n_iter=code([4, 5, 6]),
+        status=code([0, 0, 4]),
+    )
+
+
+def test_views_of_eta(shapes, xp, dtype, to_xp):
+    norm = np.hypot(0.6, 0.3)
+    for view, function in ((shapes.e, np.tanh(norm)), (shapes.g, np.tanh(norm / 2.0))):
+        expected = np.array([[0.0, 0.0], function * ETA[1] / norm, [np.nan, np.nan]])
+        assert_close(view, to_xp(expected, dtype), **tolerance("algebra", dtype), xp=xp)
+
+
+def test_measured_is_what_no_failure_flag_denies(shapes, to_np):
+    assert to_np(shapes.measured).tolist() == [True, True, False]
+    assert int(Flag.SIZE_AT_BOUND) & int(FAILED) == 0
+
+
+def test_rows_are_taken_in_the_order_asked_for(shapes, xp, to_xp):
+    taken = shapes.take(to_xp(np.array([1, 0, 1])))
+    assert taken.n_gal == 3
+    for field in fields(shapes):
+        whole, part = getattr(shapes, field.name), getattr(taken, field.name)
+        for i, row in enumerate((1, 0, 1)):
+            assert_equal(part[i, ...], whole[row, ...], xp=xp)
+
+
+def test_joining_the_parts_gives_the_whole(shapes, xp, to_xp):
+    parts = [shapes.take(to_xp(np.array(rows))) for rows in ([0], [1, 2])]
+    joined = fx.ShapeResult.concat(parts)
+    for field in fields(shapes):
+        assert_equal(getattr(joined, field.name), getattr(shapes, field.name), xp=xp)
+
+
+def test_nothing_is_measured_until_it_is(xp, dtype, device, to_xp, to_np):
+    nothing = fx.ShapeResult.unmeasured(to_xp(np.zeros((2, 5, 7)), dtype))
+    for field in fields(nothing):
+        values = getattr(nothing, field.name)
+        assert values.shape[0] == 2
+        if xp.isdtype(values.dtype, "real floating"):
+            assert values.dtype == dtype
+            assert bool(xp.all(xp.isnan(values)))
+    assert to_np(nothing.flags).tolist() == [int(Flag.NO_ATTEMPT)] * 2
+    assert not np.any(to_np(nothing.measured))
+
+
+def test_the_copy_on_the_host(shapes, to_np):
+    host = shapes.to_numpy()
+    for field in fields(shapes):
+        assert type(getattr(host, field.name)) is np.ndarray
+        np.testing.assert_array_equal(getattr(host, field.name), to_np(getattr(shapes, field.name)))
+
+
+def test_the_table_has_a_unit_or_a_description_for_every_column(shapes, to_np):
+    table = shapes.to_table()
+    assert table.colnames == list(COLUMNS)
+    for name in table.colnames:
+        assert table[name].description
+    assert {name for name in table.colnames if table[name].unit is not None} == {"x", "y", "size"}
+    assert str(table["size"].unit) == "pix"
+    np.testing.assert_array_equal(table["eta2"], to_np(shapes.eta)[:, 1])
+    np.testing.assert_array_equal(table["eta12_cov"], to_np(shapes.eta_cov)[:, 0, 1])
+    np.testing.assert_array_equal(table["e1"], to_np(shapes.e)[:, 0])
+    np.testing.assert_array_equal(table["y"], to_np(shapes.centroid)[:, 1])
