@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import subprocess
 import sys
 
@@ -227,7 +226,6 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     kilobyte = 1024 if sys.platform != "darwin" else 1
     assert int(done.stdout) * kilobyte < 1e9
-    assert resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss > 0
 
 
 # --- bad galaxies: a flag on them alone ----------------------------------------------
