@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 from array_api_extra.testing import assert_equal
 
-from fdnt_xp.arrays import array_namespace, as_floating, device_of, require_dtype, to_numpy
+from fdnt_xp.arrays import (
+    array_namespace,
+    as_floating,
+    compiles_every_shape,
+    device_of,
+    require_dtype,
+    to_numpy,
+)
 from fdnt_xp.errors import FdntTypeError, NamespaceError
 
 # --- array_namespace -----------------------------------------------------------------
@@ -119,3 +126,11 @@ def test_the_copy_on_the_host_is_a_copy(xp, to_xp):
     host = to_numpy(there)
     host[0] = 9.0
     assert_equal(there, to_xp([1.0, 2.0]), xp=xp)
+
+
+# --- what a library is like ----------------------------------------------------------
+
+
+def test_only_jax_compiles_every_shape(backend, to_xp):
+    namespace = array_namespace(stamps=to_xp([1.0]))
+    assert compiles_every_shape(namespace) is (backend.library == "jax")

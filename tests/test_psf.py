@@ -189,6 +189,9 @@ def test_the_weight_ends_smoothly(dtype, to_xp, to_np):
     # As a square: half as far from the end, a quarter of the value and half of the slope.
     np.testing.assert_allclose(value[:2] / value[1:3], 4.0, rtol=0.2)
     np.testing.assert_allclose(slope[:2] / slope[1:3], 2.0, rtol=0.2)
+    # To the very end: no kink remains where the table stops.
+    _, last = psf.weight.evaluate(to_xp([[1.0 - 1e-5]], dtype))
+    assert abs(float(to_np(last)[0, 0])) < 2e-3 * abs(slope[2])
 
 
 @JAX_COMPILES

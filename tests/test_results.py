@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 from array_api_extra.testing import assert_close, assert_equal
 
 import fdnt_xp as fx
-from fdnt_xp.flags import FAILED, Flag
+from fdnt_xp.arrays import device_of
+from fdnt_xp.flags import FAILED, INFORMATION, Flag
+from fdnt_xp.nulltests.dogleg import Status
 from fdnt_xp.shapes.results import COLUMNS
 from tolerances import tolerance
 
@@ -96,3 +98,69 @@ def test_the_table_has_a_unit_or_a_description_for_every_column(shapes, to_np):
     np.testing.assert_array_equal(table["eta12_cov"], to_np(shapes.eta_cov)[:, 0, 1])
     np.testing.assert_array_equal(table["e1"], to_np(shapes.e)[:, 0])
     np.testing.assert_array_equal(table["y"], to_np(shapes.centroid)[:, 1])
+
+
+# --- no rows, every column, every flag -----------------------------------------------
+
+
+def test_no_rows_are_a_result_too(shapes, xp, to_xp):
+    nothing = shapes.take(to_xp(np.empty(0, dtype=np.int64)))
+    assert nothing.n_gal == 0
+    assert nothing.e.shape == nothing.g.shape == (0, 2)
+    assert nothing.to_table().colnames == list(COLUMNS)
+    whole = fx.ShapeResult.concat([nothing, shapes, nothing])
+    for field in fields(shapes):
+        assert_equal(getattr(whole, field.name), getattr(shapes, field.name), xp=xp)
+        assert getattr(nothing, field.name).dtype == getattr(shapes, field.name).dtype
+
+
+@pytest.mark.parametrize("n_gal", [0, 2])
+def test_what_is_unmeasured_fits_what_is_measured(n_gal, shapes, xp, dtype, device, to_xp, to_np):
+    nothing = fx.ShapeResult.unmeasured(to_xp(np.zeros((n_gal, 5, 7)), dtype))
+    for field in fields(nothing):
+        ours, theirs = getattr(nothing, field.name), getattr(shapes, field.name)
+        assert ours.shape == (n_gal, *theirs.shape[1:])
+        assert ours.dtype == theirs.dtype
+        assert device_of(ours) == device
+    assert to_np(nothing.status).tolist() == [int(Status.RUNNING)] * n_gal
+    assert to_np(nothing.n_iter).tolist() == [0] * n_gal
+    assert fx.ShapeResult.concat([shapes, nothing]).n_gal == 3 + n_gal
+
+
+def test_each_flag_either_fails_or_informs(to_xp, to_np):
+    empty = fx.ShapeResult.unmeasured(to_xp(np.zeros((len(Flag), 2, 2))))
+    bits = np.array([int(flag) for flag in Flag], dtype=np.int32)
+    informs = [bool(flag & INFORMATION) for flag in Flag]
+    assert to_np(replace(empty, flags=to_xp(bits)).measured).tolist() == informs
+    # Information does not make up for a failure.
+    both = to_xp(bits | np.int32(INFORMATION))
+    assert to_np(replace(empty, flags=both).measured).tolist() == informs
+
+
+def test_the_copy_on_the_host_is_a_copy(shapes, to_np):
+    shapes.to_numpy().size[0] = -1.0
+    assert to_np(shapes.size)[0] == 1.5
+
+
+def test_every_column_of_the_table_is_its_own(shapes, to_np):
+    table = shapes.to_table()
+    given = {field.name: to_np(getattr(shapes, field.name)) for field in fields(shapes)}
+    e, g = to_np(shapes.e), to_np(shapes.g)
+    expected = {
+        "x": given["centroid"][:, 0],
+        "y": given["centroid"][:, 1],
+        "eta1": given["eta"][:, 0],
+        "eta2": given["eta"][:, 1],
+        "eta1_var": given["eta_cov"][:, 0, 0],
+        "eta2_var": given["eta_cov"][:, 1, 1],
+        "eta12_cov": given["eta_cov"][:, 0, 1],
+        "e1": e[:, 0],
+        "e2": e[:, 1],
+        "g1": g[:, 0],
+        "g2": g[:, 1],
+    } | {name: column for name, column in given.items() if column.ndim == 1}
+    assert set(expected) == set(COLUMNS)
+    for name, column in expected.items():
+        # The views are computed again, on the host.
+        np.testing.assert_allclose(table[name], column, rtol=1e-6, atol=0.0, err_msg=name)
+        assert table[name].dtype == column.dtype

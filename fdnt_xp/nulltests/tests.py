@@ -86,7 +86,9 @@ class TestNoise:
     Parameters
     ----------
     even, odd : array, shape (n_gal, 2, 2)
-        Covariances of (t1, t2), the noise of a free width included, and of (tx, ty).
+        Covariances of (t1, t2), the noise of a free width included, and of (tx, ty) at
+        fixed width: what a free one adds there, and between even and odd tests, vanishes
+        for galaxies with inversion symmetry and is left out for all.
     flux, flux_variance : array, shape (n_gal,)
         Amplitude F of the Gaussian galaxy `F exp(-q sigma²/2)` that has the same sum under
         the weight.
