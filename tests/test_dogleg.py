@@ -132,9 +132,6 @@ class Equations:
 
 
 def search(problem, x0, **options):
-    if array_namespace(x0=x0).__name__ == "jax.numpy":
-        # Every new batch length costs JAX seconds of compilation, so none is made.
-        options.setdefault("compact_below", 0.0)
     return find_root(problem, x0, options=DoglegOptions(**options))
 
 

@@ -23,7 +23,7 @@ from fdnt_xp.app.plots import (
 )
 from fdnt_xp.app.ring import TARGET, check_json, write_json
 from fdnt_xp.data.catalog import check_catalog, write_catalog
-from fdnt_xp.data.profiles import TEST_GALAXIES, gaussian_psf
+from fdnt_xp.data.profiles import TEST_GALAXIES, gaussian_psf, load_galsim
 from fdnt_xp.data.ring import ESTIMATORS, RingResult, draw, ring_test
 
 if TYPE_CHECKING:
@@ -199,8 +199,6 @@ def _draw_image(axes: Axes, name: str) -> None:
 
 
 def _seen(name: str) -> np.ndarray[Any, Any]:
-    from fdnt_xp.data.profiles import load_galsim
-
     both = [TEST_GALAXIES[name](), gaussian_psf(PSF_RADII[0])]
     return draw(load_galsim().Convolve(both), 64, pixel=False)
 

@@ -153,14 +153,14 @@ def plot_ring(result: RingResult, title: str) -> Figure:
         figure = new_figure(9.5, 3.6)
         left, right = figure.subplots(1, 2, sharey=True)
         names = list(result.biases)
-        for name, bias in result.biases.items():
-            row = names.index(name)
-            _dot(left, row, abs(bias.m), COLOURS[name], filled=bias.m > 0, label=f"{bias.m:+.1e}")
-            c = math.hypot(*bias.c)
-            _dot(right, row, c, COLOURS[name], filled=True, label=f"{c:.0e}")
-        left.axvspan(1e-12, TARGET, color=GREEN, alpha=0.10, lw=0, zorder=0)
         left.set(xscale="log", xlabel="$|m|$   (open: negative)", xlim=(1e-10, 1.0))
         right.set(xscale="log", xlabel="$|c|$", xlim=(1e-15, 1e-3))
+        for name, bias in result.biases.items():
+            row = names.index(name)
+            _dot(left, row, bias.m, COLOURS[name], f"{bias.m:+.1e}")
+            c = math.hypot(*bias.c)
+            _dot(right, row, c, COLOURS[name], f"{c:.0e}")
+        left.axvspan(1e-12, TARGET, color=GREEN, alpha=0.10, lw=0, zorder=0)
         left.set_yticks(range(len(names)), names)
         left.set_ylim(len(names) - 0.5, -0.6)
         eta = math.hypot(*result.delta_eta)
@@ -168,11 +168,12 @@ def plot_ring(result: RingResult, title: str) -> Figure:
     return figure
 
 
-def _dot(axes: Axes, row: int, value: float, colour: str, *, filled: bool, label: str) -> None:
-    low, high = (1e-10, 1.0) if label[0] in "+-" else (1e-15, 1e-3)
-    value = min(max(value, 2.0 * low), high)
+def _dot(axes: Axes, row: int, signed: float, colour: str, label: str) -> None:
+    """Draw the modulus of a number, open if it is negative, at the edge if it is off the axis."""
+    low, high = axes.get_xlim()
+    value = min(max(abs(signed), 2.0 * low), high)
     axes.plot([low, value], [row, row], color=PALE, lw=1.2, zorder=1)
-    face = colour if filled else "white"
+    face = "white" if signed < 0 else colour
     axes.plot([value], [row], "o", ms=7, mec=colour, mfc=face, mew=1.6, zorder=2)
     axes.annotate(
         label, (value, row), xytext=(0, 7), textcoords="offset points", ha="center", fontsize=8.5

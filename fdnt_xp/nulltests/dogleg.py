@@ -15,7 +15,14 @@ from operator import add
 from types import ModuleType
 from typing import Final, Protocol, Self
 
-from fdnt_xp.arrays import Array, array_namespace, as_floating, device_of, require_dtype
+from fdnt_xp.arrays import (
+    Array,
+    array_namespace,
+    as_floating,
+    compiles_every_shape,
+    device_of,
+    require_dtype,
+)
 from fdnt_xp.errors import FdntValueError, RangeError, ShapeMismatchError
 
 # Nocedal & Wright 2006, algorithm 4.1, for the ratio of the real to the promised reduction
@@ -86,9 +93,10 @@ class DoglegOptions:
         A rejected step that leaves no more ends the search. Default: 10 eps initial_radius.
     check_every : int
         Steps between two looks at how many rows still run; each look waits for the device.
-    compact_below : float
+    compact_below : float, optional
         Finished rows leave the batch when no more than this fraction of it runs. It changes
-        the speed, as does `check_every`, never the result.
+        the speed, as does `check_every`, never the result. Default: 0.75, and 0 (never)
+        where each new length of a batch is compiled anew.
     """
 
     ftol: float | None = None
@@ -97,7 +105,7 @@ class DoglegOptions:
     max_radius: float = 100.0
     min_radius: float | None = None
     check_every: int = 1
-    compact_below: float = 0.75
+    compact_below: float | None = None
 
     def __post_init__(self) -> None:
         """Refuse numbers that mean nothing."""
@@ -217,6 +225,9 @@ def find_root(problem: RootProblem, x0: Array, *, options: DoglegOptions = _DEFA
     eps, ftol, least = float(xp.finfo(x0.dtype).eps), options.ftol, options.min_radius
     ftol = (1e-11 if eps < 1e-12 else 1e-5) if ftol is None else ftol
     least = 10.0 * eps * options.initial_radius if least is None else least
+    compact_below = options.compact_below
+    if compact_below is None:
+        compact_below = 0.0 if compiles_every_shape(xp) else 0.75
     state = _start(xp, problem, x0, options.initial_radius, ftol)
     finished: list[_State] = []
     for i in range(options.max_iter):
@@ -226,7 +237,7 @@ def find_root(problem: RootProblem, x0: Array, *, options: DoglegOptions = _DEFA
             n_running = n - int(xp.sum(done))
             if n_running == 0:
                 break
-            if n_running < n and n_running <= options.compact_below * n:
+            if n_running < n and n_running <= compact_below * n:
                 order = xp.argsort(done, stable=True)
                 finished.append(state.take(order[n_running:]))
                 state, problem = state.take(order[:n_running]), problem.take(order[:n_running])

@@ -18,7 +18,7 @@ of `W I~` and `(d𝒯/dq) I~` (docs, "Sheared moments are moments").
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from fdnt_xp.arrays import Array, array_namespace
 from fdnt_xp.fourier.grid import KGrid
@@ -144,11 +144,10 @@ class NullTests:
         """Return the tests of the given galaxies (integer array)."""
         xp = array_namespace(rows=rows)
         fixed = self.fixed_width
-        return NullTests(
-            grid=self.grid,
+        return replace(
+            self,
             galaxies=self.galaxies.take(rows),
             weight=self.weight.take(rows),
-            length=self.length,
             fixed_width=None if fixed is None else xp.take(fixed, rows, axis=0),
         )
 
@@ -282,10 +281,10 @@ class NullTests:
         f0 = view.forms.forms[0]
         flux, square = a0[:, 0], contract(a2, f0)[:, 0]
         if self.fixed_width is not None:
-            zero, zeros = xp.zeros_like(flux), xp.zeros_like(a0) * xp.ones_like(f0[:, :1])
+            zero = xp.zeros_like(flux)
             return MatchedWidth(
                 width=self.fixed_width,
-                by_parameter=xp.concat([zeros] * 4, axis=-1),
+                by_parameter=xp.stack([zero] * 4, axis=-1),
                 by_ln_shrink=zero,
                 by_ln_square=zero,
                 flux=flux,
@@ -384,14 +383,20 @@ class NullTests:
         """Divide the tests by t0, and count centroids in units of L."""
         xp = array_namespace(values=values)
         scale = values[:, 4:]
-        nan = xp.full_like(scale, float("nan"))
-        inverse = xp.where(scale > 0, 1.0 / xp.where(scale > 0, scale, xp.ones_like(scale)), nan)
+        inverse = inverse_if_positive(scale)
         raw = values[:, :4] * inverse
         jac = (slopes[:, :4, :] - raw[:, :, None] * slopes[:, 4:, :]) * inverse[:, :, None]
         inv = 1.0 / self.length
         f = xp.concat([raw[:, :2], inv * raw[:, 2:]], axis=-1)
         jac = xp.concat([jac[:, :2, :], inv * jac[:, 2:, :]], axis=1)
         return f, xp.concat([jac[:, :, :2], self.length * jac[:, :, 2:]], axis=2)
+
+
+def inverse_if_positive(scale: Array) -> Array:
+    """Return 1/x where x > 0, elsewhere NaN: tests over such a scale have no value."""
+    xp = array_namespace(scale=scale)
+    safe = xp.where(scale > 0, scale, xp.ones_like(scale))
+    return xp.where(scale > 0, 1.0 / safe, xp.full_like(scale, float("nan")))
 
 
 def _gauss(square: Array, width: Array) -> Array:

@@ -21,6 +21,7 @@ from typing import Final
 import numpy as np
 
 from fdnt_xp.arrays import Array, array_namespace, device_of
+from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.interpolation import CubicTable, cubic_table
 from fdnt_xp.fourier.psf import Psf
 
@@ -104,6 +105,23 @@ class Weight:
         safe = xp.where(at_zero, xp.ones_like(t), t)
         by_square = xp.where(at_zero, xp.zeros_like(t), slope / safe)
         return value, by_square * (0.5 * scale**2)[:, None]
+
+    def round_window(self, grid: KGrid, size: float, shrink: Array | None = None) -> Array:
+        """Return the weight of a round galaxy on the modes of a grid, shape (n_psf, n_k).
+
+        Parameters
+        ----------
+        size : float
+            sigma, pixels.
+        shrink : array, shape (n_psf,), optional
+            s; 1 without it.
+        """
+        xp = array_namespace(kmax=self.kmax)
+        shrink = xp.ones_like(self.kmax) if shrink is None else shrink
+        square = (grid.kx**2 + grid.ky**2)[None, :]
+        square = xp.broadcast_to(square, (int(self.kmax.shape[0]), grid.n_k))
+        psf_factor, _ = self.psf_factor(square, shrink)
+        return psf_factor * xp.exp(-0.5 * size**2 * square)
 
     def matched_width(self, inverse_square: Array, shrink: Array) -> tuple[Array, Array, Array]:
         """Solve the size equation: the weight whose mean square wave number is the galaxy's.

@@ -6,13 +6,14 @@ right one. Under a fixed round weight the dipole alone is solved, from the stamp
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
-from fdnt_xp.arrays import Array, array_namespace, compiles_every_shape
+from fdnt_xp.arrays import Array, array_namespace
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.transform import DeconvolvedStamps
 from fdnt_xp.nulltests.dogleg import DoglegOptions, find_root
+from fdnt_xp.nulltests.tests import inverse_if_positive
 from fdnt_xp.nulltests.weights import Weight
 
 _WIDE: Final = 0.125
@@ -42,12 +43,8 @@ class DipoleTests:
         """Return the problem of the given galaxies (integer array)."""
         xp = array_namespace(rows=rows)
         shared = int(self.weight.shape[0]) == 1
-        return DipoleTests(
-            grid=self.grid,
-            galaxies=self.galaxies.take(rows),
-            weight=self.weight if shared else xp.take(self.weight, rows, axis=0),
-            length=self.length,
-        )
+        weight = self.weight if shared else xp.take(self.weight, rows, axis=0)
+        return replace(self, galaxies=self.galaxies.take(rows), weight=weight)
 
     def evaluate(self, x: Array) -> tuple[Array, Array]:
         """Return `sum W Im I~ k / (L sum W Re I~ |k|²)` and its Jacobian by x0/L.
@@ -59,8 +56,7 @@ class DipoleTests:
         _, even, _ = self.grid.even_moments(self.weight * re)
         odd, cubic = self.grid.odd_moments(self.weight * im)
         scale = self.length * (even[:, 0:1] + even[:, 2:3])
-        nan = xp.full_like(scale, float("nan"))
-        inverse = xp.where(scale > 0, 1.0 / xp.where(scale > 0, scale, xp.ones_like(scale)), nan)
+        inverse = inverse_if_positive(scale)
         f = odd * inverse
         # d Im/dx0 = kx Re, and d(scale)/dx0 = -L sum W Im k |k|².
         slope = xp.stack([even[:, 0:2], even[:, 1:3]], axis=1)
@@ -79,14 +75,7 @@ def starting_centroid(
     xp = array_namespace(weight=weight)
     problem = DipoleTests(grid=grid, galaxies=galaxies, weight=weight, length=length)
     centre = xp.zeros_like(galaxies.re[:, :2])
-    options = DoglegOptions(
-        ftol=1e-3,
-        max_iter=12,
-        initial_radius=2.0,
-        max_radius=8.0,
-        # Taking finished rows out makes ever new shapes.
-        compact_below=0.0 if compiles_every_shape(xp) else 0.75,
-    )
+    options = DoglegOptions(ftol=1e-3, max_iter=12, initial_radius=2.0, max_radius=8.0)
     found = length * find_root(problem, centre, options=options).x
     near = xp.abs(found) <= reach
     return xp.where((near[:, 0] & near[:, 1])[:, None], found, centre)
@@ -111,7 +100,4 @@ def wide_weight(
         grid = grid.sheared(applied_shear)
         # As in the null tests: the weight may not reach out of the disc.
         shrink = shrink * xp.exp(0.5 * xp.sqrt(xp.sum(applied_shear**2)))
-    radius_squared = (grid.kx**2 + grid.ky**2)[None, :]
-    square = xp.broadcast_to(radius_squared, (int(weight.kmax.shape[0]), grid.n_k))
-    psf_factor, _ = weight.psf_factor(square, shrink)
-    return psf_factor * xp.exp(-0.5 * (_WIDE * side) ** 2 * square)
+    return weight.round_window(grid, _WIDE * side, shrink)

@@ -91,9 +91,15 @@ def check_options(*, size: float | None, padding: int, chunk_size: int | None) -
     """Refuse numbers that mean nothing."""
     if size is not None and not (math.isfinite(size) and size > 0):
         raise RangeError("size", size, 0.0, None)
-    for name, value in (("padding", padding), ("chunk_size", chunk_size)):
-        if value is not None and (value != int(value) or value < 1):
-            raise RangeError(name, value, 1, None)
+    check_count("padding", padding, 1)
+    if chunk_size is not None:
+        check_count("chunk_size", chunk_size, 1)
+
+
+def check_count(name: str, value: int, least: int) -> None:
+    """Refuse what is not a whole number from `least` up; NaN and infinity neither."""
+    if not math.isfinite(value) or value != int(value) or value < least:
+        raise RangeError(name, value, least, None)
 
 
 def prepare(

@@ -17,7 +17,6 @@ from fdnt_xp.arrays import (
     Array,
     array_namespace,
     as_floating,
-    compiles_every_shape,
     require_dtype,
 )
 from fdnt_xp.errors import RangeError, ShapeMismatchError
@@ -31,6 +30,7 @@ from fdnt_xp.shapes.centroid import starting_centroid, wide_weight
 from fdnt_xp.shapes.job import (
     FINER,
     Job,
+    check_count,
     check_options,
     check_stamps,
     galaxies_at_once,
@@ -115,8 +115,7 @@ def measure_shapes(
     n_gal = int(stamps.shape[0])
     noise = _noise_column(xp, noise_variance, stamps)
     check_options(size=size, padding=padding, chunk_size=chunk_size)
-    if max_iter != int(max_iter) or max_iter < 0:
-        raise RangeError("max_iter", max_iter, 0, None)
+    check_count("max_iter", max_iter, 0)
     if n_gal == 0:
         return ShapeResult.unmeasured(stamps)
 
@@ -198,8 +197,6 @@ def solve(job: Job, tests: NullTests, side: int) -> RootResult:
         max_iter=job.max_iter,
         initial_radius=1.0,
         max_radius=3.0,
-        # Taking finished rows out makes ever new shapes.
-        compact_below=0.0 if compiles_every_shape(xp) else 0.75,
     )
     return find_root(tests, start, options=options)
 

@@ -104,10 +104,10 @@ def _eta_covariance(tests: NullTests, root: RootResult, noise: TestNoise) -> tup
     """
     xp = array_namespace(x=root.x)
     inverse, regular = [], root.success
+    units = xp.eye(4, dtype=root.f.dtype, device=device_of(root.f))
     for j in range(4):
-        column = xp.zeros_like(root.f)
-        unit = xp.eye(4, dtype=root.f.dtype, device=device_of(root.f))[j, :]
-        solution, solved = newton_step(xp, column - unit, root.jac)
+        unit = xp.broadcast_to(units[j, :], root.f.shape)
+        solution, solved = newton_step(xp, -unit, root.jac)  # of J p = unit
         inverse.append(solution)
         regular = regular & solved
     # Rows 0 and 1 of J⁻¹, column by column.

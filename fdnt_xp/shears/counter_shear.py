@@ -12,10 +12,9 @@ stays where the PSF has left information.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from types import ModuleType
 from typing import Final, Protocol
 
-from fdnt_xp.arrays import Array, array_namespace, compiles_every_shape
+from fdnt_xp.arrays import Array, array_namespace
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.transform import DeconvolvedStamps
 from fdnt_xp.nulltests.dogleg import DoglegOptions, find_root
@@ -24,8 +23,8 @@ from fdnt_xp.nulltests.weights import Weight
 from fdnt_xp.shapes.centroid import DipoleTests
 from fdnt_xp.shears.weights import ShapeWeight
 
-_RADIUS: Final = 1.0
-"""First trust radius, in `|eta|` and in the length unit of centroids."""
+_OPTIONS: Final = DoglegOptions(max_iter=30, initial_radius=1.0, max_radius=3.0)
+"""Radii in `|eta|` and in the length unit of centroids."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,12 +102,9 @@ class FrozenQuadrupole:
     ) -> FrameValues:
         """Return the statistic on a counter-sheared grid: see `Statistic`."""
         xp = array_namespace(start=start)
-        radius_squared = (grid.kx**2 + grid.ky**2)[None, :]
-        square = xp.broadcast_to(radius_squared, (int(weight.kmax.shape[0]), grid.n_k))
-        psf_factor, _ = weight.psf_factor(square, xp.ones_like(weight.kmax))
-        window = psf_factor * xp.exp(square * (-0.5 * self.size**2))
+        window = weight.round_window(grid, self.size)
         dipole = DipoleTests(grid=grid, galaxies=galaxies, weight=window, length=self.length)
-        root = find_root(dipole, start, options=_options(xp))
+        root = find_root(dipole, start, options=_OPTIONS)
         re, _ = galaxies.shifted(grid, self.length * root.x)
         _, even, _ = grid.even_moments(window * re)
         monopole = even[:, 0] + even[:, 2]
@@ -158,7 +154,7 @@ class SolvedEta:
             length=self.length,
             fixed_width=None if self.size is None else xp.full_like(column, self.size**2),
         )
-        root = find_root(tests, start, options=_options(xp))
+        root = find_root(tests, start, options=_OPTIONS)
         found = root.success
         eta = _or_zero(root.x[:, :2], found)
         abs_eta = xp.sqrt(eta[:, 0] ** 2 + eta[:, 1] ** 2)
@@ -172,15 +168,6 @@ def in_new_frame(solution: Array, old: KGrid, new: KGrid) -> Array:
     xp = array_namespace(solution=solution)
     centroid = new.from_stamp(old.on_stamp(solution[:, -2:]))
     return xp.concat([solution[:, :-2], centroid], axis=-1)
-
-
-def _options(xp: ModuleType) -> DoglegOptions:
-    return DoglegOptions(
-        max_iter=30,
-        initial_radius=_RADIUS,
-        max_radius=3.0,
-        compact_below=0.0 if compiles_every_shape(xp) else 0.75,
-    )
 
 
 def _or_zero(v: Array, found: Array) -> Array:

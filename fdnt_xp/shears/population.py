@@ -142,7 +142,7 @@ def population_null(
 class _Sample:
     """The statistic of a sample in any frame, chunk by chunk; remembers the last solutions.
 
-    `first` and `solutions` are the only state: the starting point of the next frame.
+    `solutions` and their `frame` are the only state: the starting point of the next frame.
     """
 
     stamps: Array

@@ -8,7 +8,6 @@ is linear in the images. What it needs is centroids that follow the shear.
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -17,7 +16,7 @@ from types import ModuleType
 from typing import Final
 
 from fdnt_xp.arrays import Array, array_namespace, as_floating, device_of, require_dtype
-from fdnt_xp.errors import FdntValueError, FdntWarning, RangeError, ShapeMismatchError
+from fdnt_xp.errors import FdntValueError, FdntWarning, ShapeMismatchError
 from fdnt_xp.flags import flag_names
 from fdnt_xp.fourier.psf import Psf
 from fdnt_xp.fourier.transform import DeconvolvedStamps, deconvolve
@@ -25,7 +24,15 @@ from fdnt_xp.nulltests.dogleg import DoglegOptions, find_root
 from fdnt_xp.nulltests.tests import NullTests
 from fdnt_xp.nulltests.weights import Weight
 from fdnt_xp.shapes.centroid import DipoleTests, starting_centroid, wide_weight
-from fdnt_xp.shapes.job import Job, check_stamps, galaxies_at_once, prepare, screen
+from fdnt_xp.shapes.job import (
+    Job,
+    check_count,
+    check_options,
+    check_stamps,
+    galaxies_at_once,
+    prepare,
+    screen,
+)
 from fdnt_xp.shapes.measure import solve
 from fdnt_xp.shapes.results import ShapeResult
 from fdnt_xp.shapes.solution import describe
@@ -113,7 +120,8 @@ def shear_from_stack(
     """
     xp, stamps = check_stamps(stamps, psf)
     n_gal = int(stamps.shape[0])
-    _check_numbers(n_groups, padding, chunk_size)
+    check_count("n_groups", n_groups, 2)
+    check_options(size=None, padding=padding, chunk_size=chunk_size)
     if n_gal < 2:
         raise FdntValueError(f"stamps holds {n_gal} galaxies; a mean with an error needs two")
     everyone = xp.ones(n_gal, dtype=xp.bool, device=device_of(stamps))
@@ -346,12 +354,3 @@ def _from_the_middle(xp: ModuleType, stamps: Array, centroids: Array | None) -> 
         [0.5 * (nx - 1), 0.5 * (ny - 1)], dtype=stamps.dtype, device=device_of(stamps)
     )
     return centroids - middle
-
-
-def _check_numbers(n_groups: int, padding: int, chunk_size: int | None) -> None:
-    numbers = (("n_groups", n_groups, 2), ("padding", padding, 1), ("chunk_size", chunk_size, 1))
-    for name, value, least in numbers:
-        if value is None:
-            continue
-        if not math.isfinite(value) or value != int(value) or value < least:
-            raise RangeError(name, value, least, None)
