@@ -56,6 +56,15 @@ def test_airy_psf_with_pixel(padding, bound):
     assert np.max(relative_error(shapes.e, e)) <= bound
 
 
+def test_airy_psf_and_galaxies_along_a_side_of_the_stamp():
+    # The stamp cuts the wings of the most elongated; the finer grid sees that it does.
+    psf = galsim.Airy(lam_over_diam=2.5, obscuration=0.3)
+    stamps, e = sersic_stamps(psf, "auto", sersic=(0.5,), angle=3.0, gsparams=ACCURATE_AIRY)
+    star = fx.Psf.from_image(psf_image(psf, "auto", gsparams=ACCURATE_AIRY), floor=1e-6)
+    assert 4e-5 < np.max(relative_error(measure(stamps, star).e, e)) < 7e-5
+    assert np.max(relative_error(measure(stamps, star, padding=2).e, e)) <= 2e-6
+
+
 def test_great08_psf_sampled_finely():
     # The star is undersampled; drawn four times finer its transform is not aliased.
     with_pixel = galsim.Convolve([GREAT08_PSF, galsim.Pixel(1.0)])

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import fdnt_xp as fx
+from fdnt_xp.data.profiles import gaussian_psf, torture
 from science.galsim_images import psf_image
 
 N_DRAWS = 2000
@@ -36,3 +37,25 @@ def test_scatter_is_what_the_covariance_says(snr, size):
         # snr is the significance under a given weight: a free size scatters the flux more.
         error = np.mean(shapes.flux / shapes.snr)
         assert np.std(shapes.flux) / error == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize("angle", [0.0, 50.0])
+def test_a_lopsided_galaxy_scatters_as_the_covariance_says(angle):
+    # Its free width adds noise to the dipoles that the covariance leaves out.
+    psf = gaussian_psf(2.0)
+    galaxy = torture().rotate(angle * galsim.degrees)
+    seen = galsim.Convolve([galaxy, psf])
+    clean = seen.drawImage(nx=96, ny=96, scale=1.0, method="no_pixel", dtype=float).array
+    sigma = np.sqrt(np.sum(clean**2)) / 100.0
+    rng = np.random.default_rng(50)
+    star = fx.Psf.from_image(psf_image(psf, "no_pixel", n=96))
+    parts = [
+        fx.measure_shapes(
+            clean + sigma * rng.standard_normal((500, 96, 96)), star, noise_variance=sigma**2
+        )
+        for _ in range(N_DRAWS // 500)
+    ]
+    eta = np.concatenate([part.eta for part in parts])
+    predicted = np.mean(np.concatenate([part.eta_cov for part in parts]), axis=0)
+    assert np.all(np.isfinite(eta))
+    np.testing.assert_allclose(np.std(eta, axis=0), np.sqrt(np.diag(predicted)), rtol=0.05)
