@@ -40,7 +40,7 @@ def array_namespace(**arrays: Array | None) -> ModuleType:
     for name, array in arrays.items():
         if array is None:
             continue
-        if not array_api_compat.is_array_api_obj(array):
+        if not is_array(array):
             raise FdntTypeError(
                 f"{name} must be an array (numpy, torch, jax, cupy, ...), "
                 f"not {type(array).__name__}"
@@ -61,6 +61,11 @@ def array_namespace(**arrays: Array | None) -> ModuleType:
     if first is None:
         raise FdntTypeError("at least one array is needed to choose the library")
     return first[1]
+
+
+def is_array(value: object) -> bool:
+    """Return whether something is an array of a library that is understood."""
+    return bool(array_api_compat.is_array_api_obj(value))
 
 
 def require_dtype(dtype: DType, **arrays: Array | None) -> None:

@@ -45,9 +45,11 @@ class Flag(IntFlag):
     """Measured on the zero-padded k grid, because the galaxy is very elongated."""
     OFF_IMAGE = 1 << 20
     """The position that was given is not on the image, or not a number."""
+    LOST_IN_FRAME = 1 << 21
+    """No centroid was found in one of the counter-sheared frames, where the galaxy counts 0."""
 
 
-INFORMATION: Final = Flag.SIZE_AT_BOUND | Flag.SIZE_FIXED | Flag.FINE_GRID
+INFORMATION: Final = Flag.SIZE_AT_BOUND | Flag.SIZE_FIXED | Flag.FINE_GRID | Flag.LOST_IN_FRAME
 """Bits that tell how a shape was measured; it may be used all the same."""
 
 FAILED: Final = ~INFORMATION & Flag(sum(int(flag) for flag in Flag))
@@ -87,4 +89,5 @@ _TEXT: Final[dict[str, str]] = {
     "NON_FINITE_RESULT": "null tests not finite",
     "FINE_GRID": "measured on the zero-padded k grid",
     "OFF_IMAGE": "position not on the image",
+    "LOST_IN_FRAME": "no centroid in a counter-sheared frame",
 }

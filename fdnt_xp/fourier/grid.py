@@ -56,6 +56,39 @@ class KGrid:
         return self.shape[0] * (self.shape[1] // 2 + 1)
 
     @cached_property
+    def row_and_column(self) -> tuple[Array, Array]:
+        """Return where each mode is in the two-dimensional `rfftn`, shape (n_k,) each."""
+        n_column = self.shape[1] // 2 + 1
+        return self.index // n_column, self.index % n_column
+
+    @cached_property
+    def quarter_turn(self) -> tuple[Array, Array]:
+        """Return how a quarter turn of the image, counter-clockwise, moves its modes.
+
+        `I~'(kx, ky) = I~(ky, -kx)`, which is another mode of the half plane or the conjugate of
+        one. Only on square grids is it always one of them.
+
+        Returns
+        -------
+        source : array of int64, shape (n_k,)
+            Number, in this grid, of the mode that each mode comes from.
+        sign : array, shape (n_k,)
+            -1 where it is conjugated.
+        """
+        xp = array_namespace(kx=self.kx)
+        row, column = self.row_and_column
+        side = self.shape[0]
+        ky = xp.where(row > side // 2, row - side, row)
+        # (ky, -kx), or minus that where it is in the other half plane.
+        other = (ky < 0) | ((ky == 0) & (column > 0))
+        new_row = xp.where(other, column, (side - column) % side)
+        new_column = xp.where(ky < 0, -ky, ky)
+        position = new_row * (self.shape[1] // 2 + 1) + new_column
+        source = xp.searchsorted(self.index, position)
+        one = xp.ones_like(self.kx)
+        return source, xp.where(other, -one, one)
+
+    @cached_property
     def squares(self) -> Array:
         """`kx², kx ky, ky²` without the half-plane weight, shape (3, n_k)."""
         xp = array_namespace(kx=self.kx)

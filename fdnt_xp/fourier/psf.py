@@ -138,6 +138,27 @@ class Psf:
         """Return the PSFs with those marked unusable whose weight ends before `least_kmax`."""
         return replace(self, usable=self.usable & (self.kmax >= least_kmax))
 
+    def ending_at(self, floor: float) -> Psf:
+        """Return the PSFs with weights that end where `𝒯` falls below a higher floor.
+
+        Where noise is, the modes beyond carry none of the signal, and leaving them out
+        saves their time. A weight that ends before stays as it is.
+        """
+        xp = array_namespace(image=self.image)
+        t = xp.linspace(0.0, 1.0, _TABLE_NODES, dtype=self.kmax.dtype, device=device_of(self.kmax))
+        t = t[None, :]
+        row = xp.arange(self.n_psf, dtype=xp.int64, device=device_of(self.kmax))
+        nodes = xp.broadcast_to(t, (self.n_psf, _TABLE_NODES))
+        reached = _first_crossing(t, self.weight.evaluate(nodes, row)[0], floor)
+        power = self.weight.evaluate(nodes * reached[:, None], row)[0]
+        kmax = self.kmax * reached
+        return replace(
+            self,
+            kmax=kmax,
+            weight=cubic_table(_ended_smoothly(power, t), zero_beyond=True),
+            largest_kmax=float(xp.max(kmax)) if self.n_psf else self.largest_kmax,
+        )
+
     def transfer(self, grid: KGrid) -> Array:
         """Return `T(k)` about the flux centroid on the modes of a grid; T(0) = 1.
 
@@ -145,17 +166,9 @@ class Psf:
         -------
         array, shape (n_psf, n_k), complex
         """
-        xp = array_namespace(image=self.image)
-        ny, nx = self.image.shape[1:]
-        kx, ky = half_plane_axes(grid)
-        along_x = _waves(kx, nx, self.oversampling)
-        along_y = _waves(ky, ny, self.oversampling)
-        # exp(-i k.x) separates: T = along_y @ image @ along_x^T on the whole half plane.
-        image = xp.astype(self.image, along_x.dtype)
-        half_plane = xp.matmul(xp.matmul(along_y, image), xp.matrix_transpose(along_x))
-        half_plane = xp.reshape(half_plane, (self.n_psf, grid.n_half_plane))
-        modes = xp.take(half_plane, grid.index, axis=1)
-        return modes * mode_phase(grid, self.centre)
+        return transform_on_modes(self.image, grid, self.oversampling) * mode_phase(
+            grid, self.centre
+        )
 
     def inverse_transfer(self, grid: KGrid) -> Array:
         """Return `1/T(k)` inside each PSF's own disc `|k| < kmax`, and zero outside.
@@ -170,6 +183,32 @@ class Psf:
         inside = (radius[None, :] < self.kmax[:, None]) & (xp.abs(transfer) > 0)
         one = xp.ones_like(transfer)
         return xp.where(inside, one / xp.where(inside, transfer, one), xp.zeros_like(transfer))
+
+
+def transform_on_modes(image: Array, grid: KGrid, oversampling: float) -> Array:
+    """Return the transform of images, about the middle of their arrays, on a grid's modes.
+
+    `exp(-i k.x)` separates, `T = along_y @ image @ along_xᵀ` on the whole half plane, so
+    the direct sums are two matrix products.
+
+    Parameters
+    ----------
+    image : array, shape (n_psf, ny, nx)
+    oversampling : float
+        Pixels of `image` per pixel of the galaxies.
+
+    Returns
+    -------
+    array, shape (n_psf, n_k), complex
+    """
+    xp = array_namespace(image=image)
+    n_psf, ny, nx = image.shape
+    kx, ky = half_plane_axes(grid)
+    along_x, along_y = _waves(kx, nx, oversampling), _waves(ky, ny, oversampling)
+    image = xp.astype(image, along_x.dtype)
+    half_plane = xp.matmul(xp.matmul(along_y, image), xp.matrix_transpose(along_x))
+    half_plane = xp.reshape(half_plane, (n_psf, grid.n_half_plane))
+    return xp.take(half_plane, grid.index, axis=1)
 
 
 def _normalised(image: Array) -> tuple[Array, Array]:
@@ -221,11 +260,29 @@ def _circularise(image: Array, oversampling: float, floor: float) -> tuple[Array
 
 
 def _mean_power(image: Array, radii: Array, n_angle: int, oversampling: float) -> Array:
-    """Return `<|T|^-2>_θ^-1` on circles, shape (n_psf, n_radius).
+    """Return `<|T|^-2>_θ^-1` on circles, shape (n_psf, n_radius)."""
+    xp = array_namespace(image=image)
+    power = power_on_circles(image, radii, n_angle, oversampling)
+    dark = xp.any(power <= 0, axis=-1)
+    inverse = xp.mean(1.0 / xp.where(power > 0, power, xp.ones_like(power)), axis=-1)
+    return xp.where(dark, xp.zeros_like(inverse), 1.0 / inverse)
 
-    `radii` (n_psf or 1, n_radius) are in rad/pixel of the galaxies. |T| is the same at k
-    and -k, so half a circle is enough; on equidistant points of it the mean converges
-    exponentially.
+
+def power_on_circles(image: Array, radii: Array, n_angle: int, oversampling: float) -> Array:
+    """Return `|T|²` of images on circles, shape (n_psf, n_radius, n_angle).
+
+    `|T|` is the same at k and -k, so half a circle is enough; on equidistant points of it
+    means over the angle converge exponentially.
+
+    Parameters
+    ----------
+    image : array, shape (n_psf, ny, nx)
+    radii : array, shape (n_psf or 1, n_radius)
+        rad/pixel of the galaxies.
+    n_angle : int
+        Angles `π (j + ½)/n_angle`.
+    oversampling : float
+        Pixels of `image` per pixel of the galaxies.
     """
     xp = array_namespace(image=image)
     ny, nx = image.shape[1:]
@@ -244,10 +301,7 @@ def _mean_power(image: Array, radii: Array, n_angle: int, oversampling: float) -
     sin_sum = xp.matmul(xp.sin(phase_x), rows)
     re = xp.sum(cos_sum * cos_y - sin_sum * sin_y, axis=-1)
     im = xp.sum(cos_sum * sin_y + sin_sum * cos_y, axis=-1)
-    power = xp.reshape(re**2 + im**2, (int(image.shape[0]), n_radius, n_angle))
-    dark = xp.any(power <= 0, axis=-1)
-    inverse = xp.mean(1.0 / xp.where(power > 0, power, xp.ones_like(power)), axis=-1)
-    return xp.where(dark, xp.zeros_like(inverse), 1.0 / inverse)
+    return xp.reshape(re**2 + im**2, (int(image.shape[0]), n_radius, n_angle))
 
 
 def _first_crossing(radii: Array, power: Array, floor: float) -> Array:

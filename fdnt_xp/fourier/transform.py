@@ -84,8 +84,8 @@ def mode_phase(grid: KGrid, position: Array) -> Array:
     """Return `exp(+i k.x)` on the modes of the data, shape (n, n_k), complex.
 
     The exponential of a sum is a product of two that are made along one axis each, which
-    halves the time. Uses the modes named by `grid.index`, not `grid.kx`: a counter-sheared
-    grid has other coordinates for the same data.
+    saves most of the exponentials. Uses the modes named by `grid.index`, not `grid.kx`: a
+    counter-sheared grid has other coordinates for the same data.
 
     Parameters
     ----------
@@ -96,9 +96,8 @@ def mode_phase(grid: KGrid, position: Array) -> Array:
     kx, ky = half_plane_axes(grid)
     along_x = xp.exp(complex_like(position[:, 0:1] * kx) * 1j)
     along_y = xp.exp(complex_like(position[:, 1:2] * ky) * 1j)
-    phase = along_y[:, :, None] * along_x[:, None, :]
-    phase = xp.reshape(phase, (int(position.shape[0]), grid.n_half_plane))
-    return xp.take(phase, grid.index, axis=1)
+    row, column = grid.row_and_column
+    return xp.take(along_y, row, axis=1) * xp.take(along_x, column, axis=1)
 
 
 def complex_like(array: Array) -> Array:

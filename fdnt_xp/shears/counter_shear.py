@@ -21,10 +21,31 @@ from fdnt_xp.nulltests.dogleg import DoglegOptions, find_root
 from fdnt_xp.nulltests.tests import NullTests
 from fdnt_xp.nulltests.weights import Weight
 from fdnt_xp.shapes.centroid import DipoleTests
+from fdnt_xp.shears.cuts import FrameQuantities
 from fdnt_xp.shears.weights import ShapeWeight
 
 _OPTIONS: Final = DoglegOptions(max_iter=30, initial_radius=1.0, max_radius=3.0)
 """Radii in `|eta|` and in the length unit of centroids."""
+_CENTROID_OPTIONS: Final = DoglegOptions(
+    ftol=1e-4, max_iter=30, initial_radius=1.0, max_radius=3.0
+)
+"""A last step of Newton's, taken on the moments alone, squares what ftol leaves."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameNoise:
+    """Noise of the deconvolved images in one frame.
+
+    Parameters
+    ----------
+    power : array, shape (n_gal or 1, n_k)
+        For pixels of variance 1, synthetic noise included.
+    variance : array, shape (n_gal,)
+        Of the pixels.
+    """
+
+    power: Array
+    variance: Array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,11 +61,14 @@ class FrameValues:
         Where it did not fail.
     solution : array, shape (n_gal, d)
         Unknowns that were solved, the start of the next frame.
+    quantities : FrameQuantities
+        What cuts may be made on; NaN where the statistic failed.
     """
 
     v: Array
     found: Array
     solution: Array
+    quantities: FrameQuantities
 
 
 class Statistic(Protocol):
@@ -56,7 +80,12 @@ class Statistic(Protocol):
         ...
 
     def evaluate(
-        self, grid: KGrid, galaxies: DeconvolvedStamps, weight: Weight, start: Array
+        self,
+        grid: KGrid,
+        galaxies: DeconvolvedStamps,
+        weight: Weight,
+        start: Array,
+        noise: FrameNoise | None,
     ) -> FrameValues:
         """Return the statistic on a counter-sheared grid.
 
@@ -69,6 +98,8 @@ class Statistic(Protocol):
             Shrunk by the reach.
         start : array, shape (n_gal, n_unknown)
             A solution in another frame, or a first guess; the centroid in units of `length`.
+        noise : FrameNoise, optional
+            Of the galaxies in this frame.
         """
         ...
 
@@ -77,9 +108,13 @@ class Statistic(Protocol):
 class FrozenQuadrupole:
     """The quadrupole of each galaxy under one fixed round weight, over its monopole.
 
-    `v = -(sum W Re I~ (kx² - ky²), sum W Re I~ 2 kx ky) / sum W Re I~ |kappa|²` in the
-    counter-sheared frame, at the centroid where the dipole vanishes. No shape is solved:
-    eta stays 0. A galaxy elongated along x is narrow in kx, hence the sign.
+    In the counter-sheared frame, at the centroid where the dipole vanishes::
+
+        v = -(q1, q2) / sqrt(q0² + c² n²),   q1 = sum W Re I~ (kx² - ky²),
+        q0 = sum W Re I~ |kappa|²,           q2 = sum W Re I~ 2 kx ky,
+
+    with n the noise of q0, and 0 where the noise is unknown. No shape is solved: eta stays
+    0. A galaxy elongated along x is narrow in kx, hence the sign.
 
     Parameters
     ----------
@@ -87,10 +122,16 @@ class FrozenQuadrupole:
         sigma of the Gaussian part of the weight, pixels: one for the whole sample.
     length : float
         Unit of centroids, pixels.
+    softening : float
+        c. The larger it is, the less a faint galaxy counts.
+    farthest : float
+        Largest distance of a centroid from the middle of the stamp, pixels.
     """
 
     size: float
     length: float
+    softening: float
+    farthest: float
 
     @property
     def n_unknown(self) -> int:
@@ -98,21 +139,110 @@ class FrozenQuadrupole:
         return 2
 
     def evaluate(
-        self, grid: KGrid, galaxies: DeconvolvedStamps, weight: Weight, start: Array
+        self,
+        grid: KGrid,
+        galaxies: DeconvolvedStamps,
+        weight: Weight,
+        start: Array,
+        noise: FrameNoise | None,
     ) -> FrameValues:
         """Return the statistic on a counter-sheared grid: see `Statistic`."""
         xp = array_namespace(start=start)
         window = weight.round_window(grid, self.size)
         dipole = DipoleTests(grid=grid, galaxies=galaxies, weight=window, length=self.length)
-        root = find_root(dipole, start, options=_OPTIONS)
-        re, _ = galaxies.shifted(grid, self.length * root.x)
-        _, even, _ = grid.even_moments(window * re)
-        monopole = even[:, 0] + even[:, 2]
-        found = root.success & (monopole > 0)
-        safe = xp.where(found, monopole, xp.ones_like(monopole))
-        v = xp.stack([even[:, 2] - even[:, 0], -2.0 * even[:, 1]], axis=-1) / safe[:, None]
-        solution = xp.where(root.success[:, None], root.x, start)
-        return FrameValues(v=_or_zero(v, found), found=found, solution=solution)
+        root = find_root(dipole, start, options=_CENTROID_OPTIONS)
+        moments = moments_at(grid, galaxies, window, self.length * root.x)
+        distance = self.length * xp.sqrt(xp.sum(root.x**2, axis=-1))
+        found = root.success & (moments.monopole > 0) & (distance <= self.farthest)
+        norm = moments.monopole
+        if noise is not None and self.softening > 0:
+            norm = xp.sqrt(norm**2 + self.softening**2 * monopole_variance(grid, window, noise))
+        safe = xp.where(found, norm, xp.ones_like(norm))
+        v = -moments.quadrupole / safe[:, None]
+        return FrameValues(
+            v=_or_zero(v, found),
+            found=found,
+            solution=xp.where(found[:, None], root.x + moments.step / self.length, start),
+            quantities=frame_quantities(grid, window, moments, found, noise),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameMoments:
+    """Moments of the galaxies under a fixed window, at the centroid where the dipole vanishes.
+
+    Parameters
+    ----------
+    flux, monopole : array, shape (n_gal,)
+        `sum W Re I~` and `sum W Re I~ |kappa|²`.
+    quadrupole : array, shape (n_gal, 2)
+        `sum W Re I~ (kx² - ky², 2 kx ky)`.
+    step : array, shape (n_gal, 2)
+        From where the moments were taken to the centroid, pixels: a step of Newton's, which
+        is taken into account to first order.
+    """
+
+    flux: Array
+    monopole: Array
+    quadrupole: Array
+    step: Array
+
+
+def moments_at(
+    grid: KGrid, galaxies: DeconvolvedStamps, window: Array, centroid: Array
+) -> FrameMoments:
+    """Return the moments at the root of the dipole that is next to `centroid` (pixels)."""
+    xp = array_namespace(centroid=centroid)
+    re, im = galaxies.shifted(grid, centroid)
+    flux, (xx, xy, yy) = _columns(grid.even_moments(window * re)[:2])
+    (x, y), (xxx, xxy, xyy, yyy) = (_split(m) for m in grid.odd_moments(window * im))
+    # d Im/dx0 = kx Re: the Jacobian of the dipole is the matrix of second moments.
+    det = xx * yy - xy * xy
+    regular = det > 0
+    det = xp.where(regular, det, xp.ones_like(det))
+    step_x = xp.where(regular, (xy * y - yy * x) / det, xp.zeros_like(det))
+    step_y = xp.where(regular, (xy * x - xx * y) / det, xp.zeros_like(det))
+    # d Re/dx0 = -kx Im.
+    q1 = xx - yy - step_x * (xxx - xyy) - step_y * (xxy - yyy)
+    q2 = 2.0 * (xy - step_x * xxy - step_y * xyy)
+    q0 = xx + yy - step_x * (xxx + xyy) - step_y * (xxy + yyy)
+    return FrameMoments(
+        flux=flux,
+        monopole=q0,
+        quadrupole=xp.stack([q1, q2], axis=-1),
+        step=xp.stack([step_x, step_y], axis=-1),
+    )
+
+
+def monopole_variance(grid: KGrid, window: Array, noise: FrameNoise) -> Array:
+    """Return the variance of `sum W Re I~ |kappa|²`, shape (n_gal,)."""
+    _, _, quartic = grid.even_moments(window**2 * noise.power)
+    return noise.variance * (quartic[:, 0] + 2.0 * quartic[:, 2] + quartic[:, 4])
+
+
+def frame_quantities(
+    grid: KGrid, window: Array, moments: FrameMoments, found: Array, noise: FrameNoise | None
+) -> FrameQuantities:
+    """Return what cuts may be made on: see `FrameQuantities`."""
+    xp = array_namespace(found=found)
+    nan = xp.full_like(moments.flux, float("nan"))
+    point, (xx, _, yy) = _columns(grid.even_moments(xp.broadcast_to(window, window.shape))[:2])
+    if noise is None:
+        snr = nan
+    else:
+        # Half of V is in the real part, and each mode of the half plane counts twice.
+        variance = noise.variance * grid.even_moments(window**2 * noise.power)[0][:, 0]
+        snr = moments.flux / xp.sqrt(variance)
+    # A Gaussian of size s under a Gaussian window of size w has <k²> = 2/(s² + w²).
+    has_size = found & (moments.flux > 0)
+    safe = xp.where(has_size, moments.monopole, xp.ones_like(nan))
+    square = 2.0 * (moments.flux / safe - point / (xx + yy))
+    size = xp.sqrt(xp.maximum(square, xp.zeros_like(square)))
+    return FrameQuantities(
+        flux=xp.where(found, moments.flux / point, nan),
+        snr=xp.where(found, snr, nan),
+        size=xp.where(has_size, size, nan),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,11 +260,14 @@ class SolvedEta:
         Unit of centroids, pixels.
     size : float, optional
         Fixes sigma of the Gaussian part of the weight, pixels.
+    window_size : float
+        The same of the fixed round weight under which the quantities of cuts are measured.
     """
 
     weight: ShapeWeight
     length: float
     size: float | None
+    window_size: float
 
     @property
     def n_unknown(self) -> int:
@@ -142,7 +275,12 @@ class SolvedEta:
         return 4
 
     def evaluate(
-        self, grid: KGrid, galaxies: DeconvolvedStamps, weight: Weight, start: Array
+        self,
+        grid: KGrid,
+        galaxies: DeconvolvedStamps,
+        weight: Weight,
+        start: Array,
+        noise: FrameNoise | None,
     ) -> FrameValues:
         """Return the statistic on a counter-sheared grid: see `Statistic`."""
         xp = array_namespace(start=start)
@@ -159,8 +297,14 @@ class SolvedEta:
         eta = _or_zero(root.x[:, :2], found)
         abs_eta = xp.sqrt(eta[:, 0] ** 2 + eta[:, 1] ** 2)
         v = self.weight(abs_eta)[:, None] * eta
-        solution = xp.where(found[:, None], root.x, start)
-        return FrameValues(v=_or_zero(v, found), found=found, solution=solution)
+        window = weight.round_window(grid, self.window_size)
+        moments = moments_at(grid, galaxies, window, self.length * root.x[:, 2:])
+        return FrameValues(
+            v=_or_zero(v, found),
+            found=found,
+            solution=xp.where(found[:, None], root.x, start),
+            quantities=frame_quantities(grid, window, moments, found, noise),
+        )
 
 
 def in_new_frame(solution: Array, old: KGrid, new: KGrid) -> Array:
@@ -173,3 +317,12 @@ def in_new_frame(solution: Array, old: KGrid, new: KGrid) -> Array:
 def _or_zero(v: Array, found: Array) -> Array:
     xp = array_namespace(v=v)
     return xp.where(found[:, None], v, xp.zeros_like(v))
+
+
+def _columns(moments: tuple[Array, Array]) -> tuple[Array, tuple[Array, ...]]:
+    """Return the moment of degree 0, and those of degree 2 one by one."""
+    return moments[0][:, 0], _split(moments[1])
+
+
+def _split(moments: Array) -> tuple[Array, ...]:
+    return tuple(moments[:, j] for j in range(int(moments.shape[1])))

@@ -39,6 +39,11 @@ class ShearEstimate:
     g_err_noise : array, shape (2,), optional
         Standard error from the noise of the pixels alone; NaN where the noise is unknown.
         It is a part of `g_err`, not an addition to it.
+    g_err_jackknife : array, shape (2,), optional
+        Standard error by leaving out groups of galaxies in turn.
+    g_err_noise_power : array, shape (2,), optional
+        Systematic error from that of the noise power, which all galaxies share; not a part
+        of `g_err`.
     responsivity : float, optional
         Weighted mean of `R1`: the mean of `w eta` is `2 g responsivity`, to first order.
     cubic : float, optional
@@ -52,6 +57,7 @@ class ShearEstimate:
     n_excluded: int = 0
     g_err_noise: Array | None = None
     g_err_jackknife: Array | None = None
+    g_err_noise_power: Array | None = None
     responsivity: float | None = None
     cubic: float | None = None
 
@@ -62,8 +68,12 @@ class ShearEstimate:
 
     def to_numpy(self) -> ShearEstimate:
         """Return the same estimate with NumPy arrays, copied to the host."""
-        noise = None if self.g_err_noise is None else to_numpy(self.g_err_noise)
-        return replace(self, g=to_numpy(self.g), g_err=to_numpy(self.g_err), g_err_noise=noise)
+        arrays = {
+            field.name: to_numpy(value)
+            for field in fields(self)
+            if field.name.startswith("g") and (value := getattr(self, field.name)) is not None
+        }
+        return replace(self, **arrays)
 
     def to_dict(self) -> dict[str, Number]:
         """Return the estimate as plain Python numbers, for reports and JSON.

@@ -2,63 +2,71 @@
 
 No responsivity enters, no ellipticity gradient, no calibration. Counter-shearing is exact
 in Fourier space; at the true shear the galaxies are isotropic again, and any spin-2
-quantity of them has zero mean (docs, "The population null").
+quantity of them has zero mean (docs, "The population null"). With noise that is made round
+in the same frame that holds at any S/N (docs, "Noise made round").
 """
 
 from __future__ import annotations
 
-import itertools
 import math
+import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
-from types import ModuleType
-from typing import Final, Literal
+from dataclasses import dataclass, replace
+from typing import Final
 
-from fdnt_xp.arrays import Array, array_namespace, device_of
-from fdnt_xp.errors import FdntValueError, RangeError
+from fdnt_xp.arrays import Array, array_namespace, device_of, to_numpy
+from fdnt_xp.errors import FdntValueError, FdntWarning, RangeError
 from fdnt_xp.fourier.psf import Psf
-from fdnt_xp.fourier.transform import deconvolve
-from fdnt_xp.shapes.centroid import starting_centroid, wide_weight
-from fdnt_xp.shapes.job import (
-    Job,
-    check_options,
-    check_stamps,
-    galaxies_at_once,
-    prepare,
-    screen,
-)
 from fdnt_xp.shear import reduced_shear_from_eta
-from fdnt_xp.shears.counter_shear import (
-    FrozenQuadrupole,
-    SolvedEta,
-    Statistic,
-    in_new_frame,
-)
+from fdnt_xp.shears.counter_shear import FrameValues
+from fdnt_xp.shears.cuts import CutLike, Selection
 from fdnt_xp.shears.estimate import ShearEstimate
+from fdnt_xp.shears.frames import FrameSample, Gamma
+from fdnt_xp.shears.ratio import over_response, ratio_errors
+from fdnt_xp.shears.sample import LARGEST_SHEAR, NoiseOptions, StatisticName, make_sample
 from fdnt_xp.shears.weights import ShapeWeight
 
-_STEP: Final = 0.02
-"""Step in gamma of the numerical response: far above the solver's noise, and its error,
-of second order in the step, changes the speed of the search, not its root."""
+STEP: Final = 0.02
+"""Step in gamma of numerical responses: far above the solver's noise, and its error, of
+second order in the step, changes the speed of the search, not its root."""
 _MAX_STEPS: Final = 12
 _TOLERANCE: Final = 1e-9
 _TOLERANCE_FLOAT32: Final = 2e-5
 """Smallest step in gamma worth taking: above the rounding of each galaxy's solution."""
-_LARGEST_SHEAR: Final = 0.3
-"""`|g|` beyond which the weight's disc would have to shrink to less than three quarters."""
-_FROZEN_SIZE: Final = 1.5
-"""Default size of the frozen weight in lengths of about the size of the PSF."""
-_JACKKNIFE_GROUPS: Final = 50
+_TOLERANCE_NOISY, _TOLERANCE_HARD = 1e-4, 3e-2
+"""The same in noisy data, in standard errors; with a hard cut, where the mean has steps."""
+_SLOPE_SEEN: Final = 1e-3
+"""Least step in gamma from which a slope is learnt where hard cuts make the mean rough."""
+_DEFAULT_SHEAR: Final = 0.1
+_PILOT: Final = 20_000
+"""Galaxies that find a first shear for a sample of four times as many or more."""
+_LEAST_SNR_ETA: Final = 50.0
+"""Median S/N below which solved shapes fail too often, and jump from root to root."""
+_POWER_STEP: Final = 0.1
+"""Relative change of the noise power that shows how the shear depends on it."""
+
+
+class OutOfReachError(FdntValueError):
+    """The null, if there is one, lies beyond the shears that the weight's disc allows."""
 
 
 def population_null(
     stamps: Array,
     psf: Psf,
     *,
-    statistic: Literal["frozen", "eta"] = "frozen",
+    statistic: StatisticName = "frozen",
+    noise_variance: float | Array | None = None,
+    noise_power: Array | None = None,
+    noise_error: float | None = None,
+    isotropise: bool | None = None,
+    cut: CutLike | None = None,
+    seed: int = 0,
+    identifiers: Array | None = None,
+    noise_symmetry: Array | None = None,
     weight: ShapeWeight | None = None,
     size: float | None = None,
-    max_shear: float = 0.1,
+    softening: float = 1.0,
+    max_shear: float | None = None,
     padding: int = 1,
     chunk_size: int | None = None,
 ) -> ShearEstimate:
@@ -67,23 +75,53 @@ def population_null(
     Parameters
     ----------
     stamps : array, shape (n_gal, ny, nx)
-        Images of one galaxy each, as for `measure_shapes`.
+        Images of one galaxy each, as for `measure_shapes`. Where the noise is given, the
+        search for a galaxy begins at the middle of its stamp: it should lie within two or
+        three pixels of it.
     psf : Psf
         One for all stamps, or one for each.
     statistic : {"frozen", "eta"}
         "frozen": the normalised quadrupole of each galaxy under one fixed round weight in
         the counter-sheared frame; only the centroid is solved. "eta": the shape of each
-        galaxy, solved anew in every frame.
+        galaxy, solved anew in every frame; for S/N above 50.
+    noise_variance : float or array, shape (n_gal,), optional
+        Variance of a pixel, in (unit of the image)².
+    noise_power : array, shape (ny, nx) or (n_gal, ny, nx), optional
+        Instead: power spectrum of noise that is correlated between pixels but stationary,
+        `E|FFT(noise)|²/(ny nx)` in the order of the FFT. Its mean is the variance.
+    noise_error : float, optional
+        Relative standard error of that variance or power. The error of the shear that
+        follows is `ShearEstimate.g_err_noise_power`.
+    isotropise : bool, optional
+        Whether to add the noise that makes the noise round in the counter-sheared frame; by
+        default where the noise is given. Without it noise biases the result by about
+        `4/(S/N)²` (relative).
+    cut : Cut, sequence of Cut, dict of (low, high), or callable, optional
+        Which galaxies count, by what is measured in the same frame: see `fdnt_xp.Cut`. A
+        callable takes `FrameQuantities` and returns what each galaxy counts, (n_gal,).
+    seed : int
+        Of the synthetic noise.
+    identifiers : array of integers, shape (n_gal,), optional
+        Names of the galaxies: the synthetic noise of a galaxy depends on its name and the
+        seed alone. Row numbers by default.
+    noise_symmetry : array of integers, shape (n_gal,), optional
+        For tests of bias in which one galaxy is drawn several times with the same noise: by
+        how many quarter turns, counter-clockwise, the synthetic noise of each is turned,
+        plus 4 where its sign is changed. Square stamps only.
     weight : ShapeWeight, optional
         `w(|eta|)` that bounds the influence of elongated galaxies; for "eta" alone. Uniform
-        by default.
+        by default; where the noise is given, `ShapeWeight.bisquare(1.5)`.
     size : float, optional
         sigma of the Gaussian part of the weight, pixels. Of the "frozen" weight by default
         about 1.5 times the size of the PSF, one for the whole sample; for "eta" by default
-        matched to each galaxy.
-    max_shear : float
+        matched to each galaxy, and where the noise is given that of "frozen".
+    softening : float
+        Of "frozen": see `FrozenQuadrupole`. 8 weighs a sample of many fluxes better and is
+        more sensitive to an error of the noise power.
+    max_shear : float, optional
         Largest `|g|` in reach. The weight's disc is smaller than the PSF's by
-        `sqrt((1 + max_shear)/(1 - max_shear))`, which costs resolution.
+        `sqrt((1 + max_shear)/(1 - max_shear))`, which costs resolution. By default 0.1, and
+        0.3, the most that can be, where the shear turns out to be larger.
     padding, chunk_size : int
         As for `measure_shapes`.
 
@@ -92,12 +130,19 @@ def population_null(
     ShearEstimate
         With `g_err` from the influence function and `g_err_jackknife` from leaving out 50
         groups of neighbouring rows in turn. Galaxies for which the statistic fails count
-        as zero, which is a spin-2 quantity too, and are reported in `n_excluded`.
+        as zero, which is a spin-2 quantity too, and are reported in `n_excluded`, as are
+        those that a cut removes.
+
+    Warns
+    -----
+    FdntWarning
+        If "eta" is used below a median S/N of 50.
 
     Raises
     ------
     FdntValueError
-        If fewer than two galaxies can be used, or no null lies within `max_shear`.
+        If fewer than two galaxies can be used or pass the cut, no null lies within
+        `max_shear`, or noise is to be made round that is not given or 0.
     RangeError
         If a number is out of range; `max_shear` may be at most 0.3.
     FdntTypeError, NamespaceError, ShapeMismatchError
@@ -106,159 +151,220 @@ def population_null(
     Notes
     -----
     Newton's method in the two components, with a response by differences at the start that
-    each step improves (Broyden). The sample is evaluated six to eight times. Exact for
-    noise-free images; noise is not isotropic in the counter-sheared frame and biases the
-    result by about `4/(S/N)²` (relative).
+    each step improves (Broyden). The sample is read three or four times, a large one twice:
+    the search then begins with a part of it.
     """
-    xp, stamps = check_stamps(stamps, psf)
-    check_options(size=size, padding=padding, chunk_size=chunk_size)
-    if not 0.0 < max_shear <= _LARGEST_SHEAR:
-        raise RangeError("max_shear", max_shear, 0.0, _LARGEST_SHEAR)
-    if statistic not in ("frozen", "eta"):
-        raise FdntValueError(f'statistic must be "frozen" or "eta", not {statistic!r}')
-    if weight is not None and statistic == "frozen":
-        raise FdntValueError('weight goes with statistic="eta"; "frozen" is bounded by itself')
-    if int(stamps.shape[0]) < 2:
-        raise FdntValueError(f"stamps holds {stamps.shape[0]} galaxies; a null needs two")
-    job = prepare(xp, stamps, psf, padding, size, 0)
-    chosen: Statistic
-    if statistic == "frozen":
-        fixed = _FROZEN_SIZE * job.length if size is None else size
-        chosen = FrozenQuadrupole(size=fixed, length=job.length)
-    else:
-        uniform = weight or ShapeWeight.uniform()
-        chosen = SolvedEta(weight=uniform, length=job.length, size=size)
-    sample = _Sample(
-        stamps=stamps,
-        job=job,
-        statistic=chosen,
-        reach=math.sqrt((1.0 + max_shear) / (1.0 - max_shear)),
-        chunk_size=chunk_size or galaxies_at_once(job.coarse, stamps),
+    selection = Selection.of(cut)
+    noise = NoiseOptions(
+        noise_variance=noise_variance,
+        noise_power=noise_power,
+        isotropise=isotropise,
+        seed=seed,
+        identifiers=identifiers,
+        symmetry=noise_symmetry,
     )
-    return _estimate(xp, sample, max_shear, f"population null, {statistic}")
+    if noise_error is not None and not (math.isfinite(noise_error) and noise_error >= 0):
+        raise RangeError("noise_error", noise_error, 0.0, None)
 
-
-@dataclass(kw_only=True)
-class _Sample:
-    """The statistic of a sample in any frame, chunk by chunk; remembers the last solutions.
-
-    `solutions` and their `frame` are the only state: the starting point of the next frame.
-    """
-
-    stamps: Array
-    job: Job
-    statistic: Statistic
-    reach: float
-    chunk_size: int
-    solutions: list[Array] | None = None
-    frame: Array | None = None
-
-    def evaluate(self, gamma: Array) -> tuple[Array, Array]:
-        """Return the statistic of each galaxy, (n_gal, 2), and where it was found, at gamma."""
-        xp = array_namespace(gamma=gamma)
-        data_grid = self.job.coarse
-        grid = data_grid.sheared(gamma)
-        old = data_grid if self.frame is None else data_grid.sheared(self.frame)
-        values, found, solutions = [], [], []
-        n_gal = int(self.stamps.shape[0])
-        for i, first in enumerate(range(0, n_gal, self.chunk_size)):
-            rows = slice(first, min(first + self.chunk_size, n_gal))
-            job = self.job.rows(rows)
-            stamps, flags = screen(self.stamps[rows, :, :], job.psf)
-            galaxies = deconvolve(stamps, job.psf.inverse_transfer(data_grid), data_grid)
-            if self.solutions is None:
-                wide = wide_weight(job.weight, data_grid, min(self.stamps.shape[1:]))
-                centre = starting_centroid(
-                    data_grid, galaxies, wide, job.length, reach=0.5 * min(stamps.shape[1:])
-                )
-                zeros = [xp.zeros_like(centre)] * (self.statistic.n_unknown // 2 - 1)
-                start = xp.concat([*zeros, centre / job.length], axis=-1)
-            else:
-                start = self.solutions[i]
-            start = in_new_frame(start, old, grid)
-            result = self.statistic.evaluate(grid, galaxies, job.weight.shrunk(self.reach), start)
-            usable = result.found & (flags == 0)
-            values.append(xp.where(usable[:, None], result.v, xp.zeros_like(result.v)))
-            found.append(usable)
-            solutions.append(result.solution)
-        self.solutions, self.frame = solutions, gamma
-        return xp.concat(values, axis=0), xp.concat(found, axis=0)
-
-
-def _estimate(xp: ModuleType, sample: _Sample, max_shear: float, method: str) -> ShearEstimate:
-    """Find the null and its errors."""
-    like = {"dtype": sample.stamps.dtype, "device": device_of(sample.stamps)}
-    origin = xp.zeros((2,), **like)
-    v, found = sample.evaluate(origin)
-    n_used = int(xp.sum(xp.astype(found, xp.int64)))
-    if n_used < 2:
-        raise FdntValueError(
-            f"only {n_used} of {int(found.shape[0])} galaxies can be used; a null needs two"
+    def estimate(largest: float) -> ShearEstimate:
+        sample = make_sample(
+            stamps,
+            psf,
+            statistic=statistic,
+            weight=weight,
+            size=size,
+            softening=softening,
+            max_shear=largest,
+            padding=padding,
+            chunk_size=chunk_size,
+            noise=noise,
         )
-    steps = xp.eye(2, **like) * _STEP
-    responses = [(sample.evaluate(steps[j, :])[0] - v) / _STEP for j in (0, 1)]
-    response = xp.stack(responses, axis=-1)  # (n_gal, 2, 2), by gamma in the last axis
+        if sample.n_gal < 2:
+            raise FdntValueError(f"stamps holds {sample.n_gal} galaxies; a null needs two")
+        if sample.noise is None and selection.needs_noise:
+            raise FdntValueError("a cut on snr needs noise_variance or noise_power")
+        null = _Null(sample=sample, selection=selection, largest=2.0 * math.atanh(largest))
+        return null.estimate(f"population null, {statistic}", noise_error)
 
-    def mean(gamma: tuple[float, float]) -> tuple[float, float]:
-        nonlocal v, found
-        v, found = sample.evaluate(xp.asarray(gamma, **like))
-        return _pair(xp.mean(v, axis=0))
+    if max_shear is not None:
+        return estimate(max_shear)
+    try:
+        return estimate(_DEFAULT_SHEAR)
+    except OutOfReachError:
+        return estimate(LARGEST_SHEAR)
 
-    slope = xp.mean(response, axis=0)
-    jac = [_pair(slope[0, :]), _pair(slope[1, :])]
-    gamma = find_null(
-        mean,
-        _pair(xp.mean(v, axis=0)),
-        jac,
-        largest=2.0 * math.atanh(max_shear),
-        tolerance=_TOLERANCE if sample.stamps.dtype == xp.float64 else _TOLERANCE_FLOAT32,
-    )
-    conformal = xp.asarray(gamma, **like)
-    errors = _errors(xp, v, response)
-    # dg/dgamma = 1/2 to first order; the exact factor along gamma differs by |g|² at most.
-    g = reduced_shear_from_eta(conformal)
-    n_used = int(xp.sum(xp.astype(found, xp.int64)))
-    return ShearEstimate(
-        g=g,
-        g_err=0.5 * errors[0],
-        n_used=n_used,
-        method=method,
-        n_excluded=int(found.shape[0]) - n_used,
-        g_err_jackknife=0.5 * errors[1],
-    )
+
+@dataclass(frozen=True, kw_only=True)
+class _Null:
+    """The search for the null of a sample, and what it is worth."""
+
+    sample: FrameSample
+    selection: Selection
+    largest: float
+
+    def estimate(self, method: str, noise_error: float | None) -> ShearEstimate:
+        """Find the null and its errors."""
+        sample = self.sample
+        xp = array_namespace(stamps=sample.stamps)
+        origin = (0.0, 0.0)
+        if sample.n_gal >= 4 * _PILOT:
+            pilot = replace(self, sample=sample.rows(slice(0, _PILOT)))
+            origin, _, _ = pilot.find(origin)
+        gamma, v, response = self.find(origin)
+        counted, total = v.counted, v.values.shape[0]
+        errors = ratio_errors(v.values, response)
+        like = {"dtype": sample.stamps.dtype, "device": device_of(sample.stamps)}
+        # dg/dgamma = 1/2 to first order; the exact factor along gamma differs by |g|² at most.
+        return ShearEstimate(
+            g=reduced_shear_from_eta(xp.asarray(gamma, **like)),
+            g_err=0.5 * errors[0],
+            n_used=counted,
+            method=method,
+            n_excluded=int(total) - counted,
+            g_err_jackknife=0.5 * errors[1],
+            g_err_noise_power=None
+            if noise_error is None or sample.noise is None
+            else 0.5 * noise_error * self._by_noise_power(gamma, v, response),
+        )
+
+    def find(self, origin: Gamma) -> tuple[Gamma, _Weighed, Array]:
+        """Return the null, the values there, and the response of each, (n_gal, 2, 2)."""
+        xp = array_namespace(stamps=self.sample.stamps)
+        frames = (origin, (origin[0] + STEP, origin[1]), (origin[0], origin[1] + STEP))
+        v, *others = self._look(frames)
+        v.refuse_too_few()
+        self._warn_of_eta(v)
+        response = xp.stack([(other.values - v.values) / STEP for other in others], axis=-1)
+
+        def mean(gamma: Gamma) -> Gamma:
+            nonlocal v
+            (v,) = self._look((gamma,))
+            return _pair(xp.mean(v.values, axis=0))
+
+        slope = xp.mean(response, axis=0)
+        gamma = find_null(
+            mean,
+            _pair(xp.mean(v.values, axis=0)),
+            [_pair(slope[0, :]), _pair(slope[1, :])],
+            start=origin,
+            largest=self.largest,
+            tolerance=self._tolerance(v, response),
+            least_secant=_SLOPE_SEEN if self.selection.hard else 0.0,
+        )
+        return gamma, v, response
+
+    def _look(self, frames: tuple[Gamma, ...]) -> list[_Weighed]:
+        return [_Weighed.of(values, self.selection) for values in self.sample.evaluate(frames)]
+
+    def _tolerance(self, v: _Weighed, response: Array) -> float:
+        """Return the smallest step in gamma worth taking."""
+        xp = array_namespace(v=v.values)
+        least = _TOLERANCE if v.values.dtype == xp.float64 else _TOLERANCE_FLOAT32
+        if self.sample.noise is None and not self.selection.hard:
+            return least
+        error = min(_pair(ratio_errors(v.values, response)[0]))
+        share = _TOLERANCE_HARD if self.selection.hard else _TOLERANCE_NOISY
+        return max(least, share * error)
+
+    def _by_noise_power(self, gamma: Gamma, v: _Weighed, response: Array) -> Array:
+        """Return by how much gamma moves for a relative change of the noise power by 1."""
+        xp = array_namespace(v=v.values)
+        more = replace(self, sample=self.sample.told_of_noise(1.0 + _POWER_STEP))
+        (changed,) = more._look((gamma,))
+        moved = over_response(
+            xp.mean(response, axis=0)[None, :, :],
+            xp.mean(changed.values - v.values, axis=0)[None, :],
+        )
+        return xp.abs(moved[0, :]) / _POWER_STEP
+
+    def _warn_of_eta(self, v: _Weighed) -> None:
+        if self.sample.noise is None or self.sample.statistic.n_unknown == 2:
+            return
+        snr = to_numpy(v.snr)
+        measured = snr[snr == snr]
+        median = float(sorted(measured)[len(measured) // 2]) if len(measured) else 0.0
+        if median < _LEAST_SNR_ETA:
+            warnings.warn(
+                f'statistic="eta" is biased by per cents and noisy below an S/N of '
+                f'{_LEAST_SNR_ETA:g}; the median is {median:.3g} here. Use "frozen"',
+                FdntWarning,
+                stacklevel=6,
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Weighed:
+    """The statistic of each galaxy times what it counts, how many count, and their S/N."""
+
+    values: Array
+    counted: int
+    found: int
+    snr: Array
+
+    @classmethod
+    def of(cls, frame: FrameValues, selection: Selection) -> _Weighed:
+        xp = array_namespace(v=frame.v)
+        weight = selection.weight(frame.quantities) if selection.cuts else None
+        kept = frame.found if weight is None else frame.found & (weight > 0)
+        values = frame.v if weight is None else frame.v * weight[:, None]
+        return cls(
+            values=values,
+            counted=int(xp.count_nonzero(kept)),
+            found=int(xp.count_nonzero(frame.found)),
+            snr=frame.quantities.snr,
+        )
+
+    def refuse_too_few(self) -> None:
+        n_gal = int(self.values.shape[0])
+        if self.found < 2:
+            raise FdntValueError(
+                f"only {self.found} of {n_gal} galaxies can be used; a null needs two"
+            )
+        if self.counted < 2:
+            raise FdntValueError(
+                f"the cut keeps {self.counted} of {self.found} galaxies; a null needs two"
+            )
 
 
 def find_null(
     mean: Callable[[tuple[float, float]], tuple[float, float]],
-    at_zero: tuple[float, float],
+    at_start: tuple[float, float],
     jac: list[tuple[float, float]],
     *,
+    start: Gamma = (0.0, 0.0),
     largest: float,
     tolerance: float,
+    least_secant: float = 0.0,
 ) -> tuple[float, float]:
-    """Find the gamma at which a mean of two components vanishes, from gamma = 0.
+    """Find the gamma at which a mean of two components vanishes.
 
     Parameters
     ----------
     mean : callable
         From gamma to the mean.
-    at_zero : tuple of float
-        Its value at 0.
+    at_start : tuple of float
+        Its value at the start.
     jac : list of 2 tuples
-        Its derivative at 0, rows by component of the mean.
+        Its derivative there, rows by component of the mean.
+    start : tuple of float
+        Where to begin.
     largest : float
         Largest `|gamma|` that may be asked for.
     tolerance : float
         A step smaller than this ends the search.
+    least_secant : float
+        The derivative learns nothing from steps shorter than this.
 
     Raises
     ------
     FdntValueError
-        If the response is singular, the search leaves the range, or does not end.
+        If the response is singular, or the search does not end.
+    OutOfReachError
+        If it leaves the range.
     """
     (a, b), (c, d) = jac
-    x, y = 0.0, 0.0
-    f1, f2 = at_zero
+    x, y = start
+    f1, f2 = at_start
     for _ in range(_MAX_STEPS):
         det = a * d - b * c
         if not (math.isfinite(det) and abs(det) > 1e-12 * (a * a + b * b + c * c + d * d)):
@@ -268,7 +374,7 @@ def find_null(
             return x + sx, y + sy
         x, y = x + sx, y + sy
         if not math.hypot(x, y) <= largest:
-            raise FdntValueError(
+            raise OutOfReachError(
                 f"no null within max_shear: the search went to |g| = "
                 f"{math.tanh(0.5 * math.hypot(x, y)):.3g}, allowed is "
                 f"{math.tanh(0.5 * largest):.3g}; raise max_shear if so large a shear is meant"
@@ -277,40 +383,11 @@ def find_null(
         # Broyden: the least change of the response that explains the value just seen. What
         # the linear model left over is f itself, since the step was Newton's.
         size = sx * sx + sy * sy
+        if size < least_secant**2:
+            continue
         a, b = a + f1 * sx / size, b + f1 * sy / size
         c, d = c + f2 * sx / size, d + f2 * sy / size
     raise FdntValueError(f"no null found in {_MAX_STEPS} steps")
-
-
-def _errors(xp: ModuleType, v: Array, response: Array) -> tuple[Array, Array]:
-    """Return the standard errors of gamma: by influence, and by jackknife over groups.
-
-    The influence of a galaxy is `-R⁻¹ v`, R the mean response. A jackknife sample has its
-    own response, so the two differ by terms of order 1/n_gal.
-    """
-    n_gal = int(v.shape[0])
-    influence = _solve_pair(xp, xp.mean(response, axis=0)[None, :, :], v)
-    scatter = influence - xp.mean(influence, axis=0)
-    by_influence = xp.sqrt(xp.sum(scatter**2, axis=0) / (n_gal * (n_gal - 1.0)))
-
-    n_group = min(_JACKKNIFE_GROUPS, n_gal)
-    edges = [round(j * n_gal / n_group) for j in range(n_group + 1)]
-    total_v, total_r = xp.sum(v, axis=0), xp.sum(response, axis=0)
-    left_v, left_r = [], []
-    for lo, hi in itertools.pairwise(edges):
-        left_v.append(total_v - xp.sum(v[lo:hi, :], axis=0))
-        left_r.append(total_r - xp.sum(response[lo:hi, :, :], axis=0))
-    estimates = _solve_pair(xp, xp.stack(left_r), xp.stack(left_v))
-    scatter = estimates - xp.mean(estimates, axis=0)
-    return by_influence, xp.sqrt(xp.sum(scatter**2, axis=0) * ((n_group - 1.0) / n_group))
-
-
-def _solve_pair(xp: ModuleType, matrix: Array, vector: Array) -> Array:
-    """Return `-M⁻¹ v` for stacks of 2 by 2 matrices; shape (n, 2)."""
-    a, b = matrix[:, 0, 0], matrix[:, 0, 1]
-    c, d = matrix[:, 1, 0], matrix[:, 1, 1]
-    v1, v2 = vector[:, 0], vector[:, 1]
-    return xp.stack([b * v2 - d * v1, c * v1 - a * v2], axis=-1) / (a * d - b * c)[:, None]
 
 
 def _pair(vector: Array) -> tuple[float, float]:

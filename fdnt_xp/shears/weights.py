@@ -122,6 +122,30 @@ class ShapeWeight:
             name=f"lorentzian({scale:g})",
         )
 
+    @classmethod
+    def bisquare(cls, end: float = 1.5) -> ShapeWeight:
+        """Return `w = (1 - (|eta|/end)²)²` up to `end`, and 0 beyond: no shape counts there."""
+
+        def inside(x: Array) -> Array:
+            xp = array_namespace(x=x)
+            return xp.maximum(1.0 - (x / end) ** 2, xp.zeros_like(x))
+
+        def third(x: Array) -> Array:
+            xp = array_namespace(x=x)
+            return xp.where(x < end, 24.0 * x / end**4, xp.zeros_like(x))
+
+        def second(x: Array) -> Array:
+            xp = array_namespace(x=x)
+            value = (12.0 * (x / end) ** 2 - 4.0) / end**2
+            return xp.where(x < end, value, xp.zeros_like(x))
+
+        return cls(
+            function=lambda x: inside(x) ** 2,
+            derivatives=(lambda x: -4.0 * x / end**2 * inside(x), second, third),
+            scale=end,
+            name=f"bisquare({end:g})",
+        )
+
     def __call__(self, abs_eta: Array) -> Array:
         """Return w, shape (n,); refuse a function that changes shape or gives bad values."""
         return _checked_values(self.name, abs_eta, self.function(abs_eta))

@@ -1,0 +1,273 @@
+"""Noise in a counter-sheared frame, and the noise that makes it round there.
+
+On the deconvolved image, stationary noise has the power `V(k) = N P(k)/|T(k)|²`, with N the
+pixels of the transform and P their power: the variance of a pixel, if pixels are
+independent. V is no function of `|k|`, nor of `|kappa|` in the frame `kappa = S_gamma k` of
+a trial shear. Gaussian noise of the power
+
+    V_iso(|kappa|; gamma) - V(k),   V_iso(r; gamma) = max over θ of V(S_gamma⁻¹ r (cosθ, sinθ))
+
+is added to it, and the sum is round in that frame (docs, "Noise made round"). The maximum
+is as tight as can be: twice the noise would cost 40 % in the error of the shear.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from fdnt_xp.arrays import Array, array_namespace, device_of
+from fdnt_xp.fourier.deviates import unit_deviates
+from fdnt_xp.fourier.grid import KGrid
+from fdnt_xp.fourier.interpolation import cubic_table
+from fdnt_xp.fourier.psf import Psf, power_on_circles, transform_on_modes
+from fdnt_xp.fourier.transform import DeconvolvedStamps
+
+_RADII, _ANGLES = 41, 32
+"""Of the polar table of ln V: circles, and points on half of each. In the angle it is a
+trigonometric polynomial, in the radius a cubic."""
+_DIRECTIONS: Final = 64
+"""Over half a turn, among which the largest V is sought."""
+_MARGIN: Final = 0.004
+"""By which V_iso lies above the largest V found, for what lies between the directions."""
+_PSFS_AT_ONCE: Final = 64
+"""Bounds the memory of the trigonometric sums."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PixelNoise:
+    """Stationary noise of the pixels of each stamp.
+
+    Parameters
+    ----------
+    variance : array, shape (n_gal,)
+        Of one pixel.
+    correlation : array, shape (n_power, ny, nx), optional
+        Correlation function over lags, 1 at no lag, which is at `[ny//2, nx//2]`; one for all
+        galaxies or one for each. Pixels are independent without it.
+    """
+
+    variance: Array
+    correlation: Array | None = None
+
+    @classmethod
+    def of_power(cls, power: Array, n_gal: int) -> PixelNoise:
+        """Return the noise of a power spectrum.
+
+        Parameters
+        ----------
+        power : array, shape (n_power, ny, nx)
+            `E|FFT(noise)|²/(ny nx)` in the order of the FFT; its mean is the variance of a
+            pixel. The same at k and -k.
+        n_gal : int
+        """
+        xp = array_namespace(power=power)
+        n_power, ny, nx = power.shape
+        variance = xp.mean(xp.reshape(power, (n_power, -1)), axis=-1)
+        half = power[:, :, : nx // 2 + 1] / variance[:, None, None]
+        lags = xp.fft.irfftn(xp.astype(half, _complex_of(xp, power)), s=(ny, nx), axes=(-2, -1))
+        return cls(
+            variance=xp.broadcast_to(variance, (n_gal,)),
+            correlation=xp.roll(lags, (ny // 2, nx // 2), axis=(-2, -1)),
+        )
+
+    def rows(self, rows: slice) -> PixelNoise:
+        """Return the noise of a range of galaxies."""
+        shared = self.correlation is None or int(self.correlation.shape[0]) == 1
+        return PixelNoise(
+            variance=self.variance[rows],
+            correlation=self.correlation if shared else self.correlation[rows, :, :],
+        )
+
+    def scaled(self, factor: float) -> PixelNoise:
+        """Return the noise with its power multiplied."""
+        return replace(self, variance=self.variance * factor)
+
+    def relative_power(self, grid: KGrid) -> Array:
+        """Return `P(k)` over the variance on the modes of a grid, shape (n_power or 1, n_k)."""
+        xp = array_namespace(variance=self.variance)
+        if self.correlation is None:
+            return xp.ones_like(grid.kx)[None, :]
+        return xp.abs(transform_on_modes(self.correlation, grid, 1.0))
+
+    def relative_power_on_circles(self, radii: Array, n_angle: int) -> Array | None:
+        """Return the same on circles, (n_power, n_radius, n_angle); None where it is 1."""
+        if self.correlation is None:
+            return None
+        xp = array_namespace(radii=radii)
+        return xp.sqrt(power_on_circles(self.correlation, radii, n_angle, 1.0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeconvolvedNoise:
+    """Noise of deconvolved images, its power for pixels of variance 1 kept apart.
+
+    Parameters
+    ----------
+    power : array, shape (n_psf, n_k)
+        V of each PSF on the modes of the data; zero beyond its disc.
+    ln_polar : array, shape (n_psf, n_radius, n_angle)
+        ln V on circles of radius `kmax j/(n_radius - 1)`.
+    kmax : array, shape (n_psf,)
+        rad/pixel.
+    """
+
+    power: Array
+    ln_polar: Array
+    kmax: Array
+
+    @classmethod
+    def behind(
+        cls, psf: Psf, pixels: PixelNoise, grid: KGrid, inverse_transfer: Array
+    ) -> DeconvolvedNoise:
+        """Return the noise of pixels after division by the transfer function of the PSF.
+
+        Parameters
+        ----------
+        psf : Psf
+        pixels : PixelNoise
+            Its power, like the PSF, of all galaxies or of each.
+        grid : KGrid
+            Of the data.
+        inverse_transfer : array, shape (n_psf, n_k)
+            `psf.inverse_transfer(grid)`.
+        """
+        xp = array_namespace(kmax=psf.kmax)
+        n_modes = float(grid.shape[0] * grid.shape[1])
+        inverse_power = xp.real(inverse_transfer) ** 2 + xp.imag(inverse_transfer) ** 2
+        t = xp.linspace(0.0, 1.0, _RADII, dtype=psf.kmax.dtype, device=device_of(psf.kmax))
+        tables = []
+        for first in range(0, psf.n_psf, _PSFS_AT_ONCE):
+            rows = slice(first, min(first + _PSFS_AT_ONCE, psf.n_psf))
+            radii = psf.kmax[rows, None] * t[None, :]
+            transfer = power_on_circles(psf.image[rows, :, :], radii, _ANGLES, psf.oversampling)
+            # A PSF without light at some k ends there; the tiny number only spares the log.
+            smallest = xp.full_like(transfer, float(xp.finfo(transfer.dtype).smallest_normal))
+            ln_polar = -xp.log(xp.maximum(transfer, smallest))
+            own = pixels.correlation is not None and int(pixels.correlation.shape[0]) > 1
+            relative = (pixels.rows(rows) if own else pixels).relative_power_on_circles(
+                radii, _ANGLES
+            )
+            if relative is not None:
+                ln_polar = ln_polar + xp.log(xp.maximum(relative, smallest[:1, :, :]))
+            tables.append(ln_polar + math.log(n_modes))
+        return cls(
+            power=n_modes * pixels.relative_power(grid) * inverse_power,
+            ln_polar=xp.concat(tables, axis=0),
+            kmax=psf.kmax,
+        )
+
+    def made_round(self, grid: KGrid, gamma: tuple[float, float], reach: float) -> Array:
+        """Return V_iso on the modes of a counter-sheared grid, shape (n_psf, n_k).
+
+        Parameters
+        ----------
+        grid : KGrid
+            `KGrid.sheared(gamma)` of the grid of the data.
+        gamma : tuple of float
+            The trial shear, eta-type.
+        reach : float
+            Where the weight ends, as a divisor of `kmax`: at least `exp(|gamma|/2)`. V_iso is
+            given up to there.
+        """
+        xp = array_namespace(kmax=self.kmax)
+        like = {"dtype": self.kmax.dtype, "device": device_of(self.kmax)}
+        stretch, angle = _sheared_back(gamma)
+        n_psf = int(self.kmax.shape[0])
+        angles = np.pi * (np.arange(_ANGLES) + 0.5) / _ANGLES
+        turned = xp.matmul(self.ln_polar, xp.asarray(_interpolation(angle, angles), **like))
+        lines = xp.reshape(xp.matrix_transpose(turned), (n_psf * _DIRECTIONS, _RADII))
+        radius = np.linspace(0.0, 1.0 / reach, _RADII)
+        t = xp.asarray(np.tile(stretch[:, None] * radius, (n_psf, 1)), **like)
+        row = xp.arange(n_psf * _DIRECTIONS, dtype=xp.int64, device=device_of(self.kmax))
+        along = xp.reshape(cubic_table(lines).evaluate(t, row)[0], (n_psf, _DIRECTIONS, _RADII))
+        largest = cubic_table(xp.max(along, axis=1) + math.log1p(_MARGIN))
+        kappa = xp.sqrt(grid.kx**2 + grid.ky**2)[None, :] * (reach / self.kmax)[:, None]
+        return xp.exp(largest.evaluate(kappa, None if n_psf == 1 else row[:n_psf])[0])
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoundNoise:
+    """The synthetic noise of a batch of galaxies: drawn once, rescaled in each frame.
+
+    Parameters
+    ----------
+    re, im : array, shape (n_gal, n_k)
+        Deviates of unit power times the standard deviation of each galaxy's pixels.
+    """
+
+    re: Array
+    im: Array
+
+    @classmethod
+    def draw(
+        cls,
+        identifiers: Array,
+        seed: int,
+        variance: Array,
+        grid: KGrid,
+        symmetry: Array | None = None,
+    ) -> RoundNoise:
+        """Draw the noise of galaxies by their names: see `unit_deviates`.
+
+        Parameters
+        ----------
+        symmetry : array of integers, shape (n_gal,), optional
+            0 to 3: quarter turns, counter-clockwise, by which the noise of a galaxy is turned
+            about the middle of the stamp; 4 to 7: the same with its sign changed. For
+            square grids.
+        """
+        xp = array_namespace(variance=variance)
+        re, im = unit_deviates(identifiers, grid.index, seed=seed, dtype=variance.dtype)
+        scale = xp.sqrt(variance)[:, None]
+        if symmetry is not None:
+            re, im = _turned(re, im, grid, symmetry)
+            scale = xp.where(symmetry[:, None] >= 4, -scale, scale)
+        return cls(re=scale * re, im=scale * im)
+
+    def added_to(self, galaxies: DeconvolvedStamps, missing: Array) -> DeconvolvedStamps:
+        """Return the galaxies with noise of a missing power, shape (n_psf, n_k), added."""
+        xp = array_namespace(missing=missing)
+        scale = xp.sqrt(xp.maximum(missing, xp.zeros_like(missing)))
+        return DeconvolvedStamps(
+            re=galaxies.re + scale * self.re, im=galaxies.im + scale * self.im
+        )
+
+
+def _turned(re: Array, im: Array, grid: KGrid, symmetry: Array) -> tuple[Array, Array]:
+    """Return deviates with each row turned by its number of quarter turns."""
+    xp = array_namespace(re=re)
+    source, conjugate = grid.quarter_turn
+    turns = (symmetry % 4)[:, None]
+    for done in range(3):
+        once_re = xp.take(re, source, axis=1)
+        once_im = xp.take(im, source, axis=1) * conjugate
+        re, im = (xp.where(turns > done, a, b) for a, b in ((once_re, re), (once_im, im)))
+    return re, im
+
+
+def _sheared_back(gamma: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Return length and angle of `S_gamma⁻¹ (cosθ, sinθ)` over the directions θ."""
+    theta = np.pi * (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS
+    half = 0.5 * math.hypot(*gamma)
+    series = 0.5 if half == 0.0 else 0.5 * math.sinh(half) / half
+    cosh, s1, s2 = math.cosh(half), series * gamma[0], series * gamma[1]
+    x = (cosh - s1) * np.cos(theta) - s2 * np.sin(theta)
+    y = -s2 * np.cos(theta) + (cosh + s1) * np.sin(theta)
+    return np.hypot(x, y), np.arctan2(y, x)
+
+
+def _interpolation(target: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    """Return the matrix, (n_node, n_target), of trigonometric interpolation of period π."""
+    n = len(nodes)
+    offset = target[None, :] - nodes[:, None]
+    at_node = np.abs(np.sin(offset)) < 1e-12
+    tangent = np.where(at_node, 1.0, np.tan(offset))
+    return np.where(at_node, 1.0, np.sin(n * offset) / (n * tangent))
+
+
+def _complex_of(xp, array: Array):
+    return xp.complex64 if array.dtype == xp.float32 else xp.complex128

@@ -1,0 +1,387 @@
+"""Responses to shear, galaxy by galaxy: what a catalog needs for the shear of any part of it.
+
+The frozen quadrupole v of each galaxy, with its noise made round, as it is and under counter-shears
+of plus and minus h along both components. The mean of v over any part of a catalog, over
+the mean response, is the shear of that part, to second order in the shear; a cut on the
+quantities of the same five frames brings its own response along (docs, "Responses").
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from fdnt_xp.arrays import Array, array_namespace, as_floating, device_of, require_dtype, to_numpy
+from fdnt_xp.errors import FdntTypeError, FdntValueError, RangeError, ShapeMismatchError
+from fdnt_xp.flags import FAILED, Flag
+from fdnt_xp.fourier.psf import Psf
+from fdnt_xp.shapes.job import screen
+from fdnt_xp.shear import reduced_shear_from_eta
+from fdnt_xp.shears.counter_shear import FrameValues
+from fdnt_xp.shears.cuts import QUANTITIES, CutLike, FrameQuantities, Selection
+from fdnt_xp.shears.estimate import ShearEstimate
+from fdnt_xp.shears.ratio import over_response, ratio_errors
+from fdnt_xp.shears.sample import NoiseOptions, make_sample
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+FRAMES: Final = ("", "_1p", "_1m", "_2p", "_2m")
+"""Suffixes of columns: as seen, and with shear of +h and -h put on along each component."""
+_LARGEST_STEP: Final = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResponseResult:
+    """The quadrupole of each galaxy, and how it responds to shear.
+
+    All arrays share one library, dtype and device; row i is galaxy i. Where `flags` holds a
+    bit of `fdnt_xp.flags.FAILED`, the float columns are NaN.
+
+    Parameters
+    ----------
+    v : array, shape (n_gal, 2)
+        Normalised quadrupole; as g1, g2 are counted, and positive along the galaxy.
+    response : array, shape (n_gal, 2, 2)
+        `dv_i/dg_j`, g the reduced shear: `<v> = <response> g`.
+    snr, flux, size : array, shape (n_gal, 5)
+        What cuts may be made on (`FrameQuantities`), in the frames of `FRAMES`; NaN in a
+        frame where the galaxy was lost.
+    centroid : array, shape (n_gal, 2)
+        (x, y) in pixels of the stamp, 0-based.
+    flags : array, shape (n_gal,), int32
+        Bits of `fdnt_xp.flags.Flag`.
+    step : float
+        The shear h of the frames, as a reduced shear.
+    """
+
+    v: Array
+    response: Array
+    snr: Array
+    flux: Array
+    size: Array
+    centroid: Array
+    flags: Array
+    step: float
+
+    @property
+    def n_gal(self) -> int:
+        """Number of galaxies, measured or not."""
+        return int(self.v.shape[0])
+
+    @property
+    def measured(self) -> Array:
+        """True where the galaxy has a response, shape (n_gal,), bool."""
+        xp = array_namespace(flags=self.flags)
+        return xp.bitwise_and(self.flags, xp.full_like(self.flags, int(FAILED))) == 0
+
+    def take(self, rows: Array) -> ResponseResult:
+        """Return the galaxies with the given row numbers (integer array), in that order."""
+        xp = array_namespace(v=self.v, rows=rows)
+        arrays = {
+            f.name: xp.take(getattr(self, f.name), rows, axis=0)
+            for f in fields(self)
+            if f.name != "step"
+        }
+        return ResponseResult(step=self.step, **arrays)
+
+    def to_numpy(self) -> ResponseResult:
+        """Return the same result with NumPy arrays, copied to the host."""
+        arrays = {
+            f.name: to_numpy(getattr(self, f.name)) for f in fields(self) if f.name != "step"
+        }
+        return ResponseResult(step=self.step, **arrays)
+
+    def to_columns(self) -> dict[str, Array]:
+        """Return the scalar columns of `COLUMNS`, each of shape (n_gal,)."""
+        columns = {"x": self.centroid[:, 0], "y": self.centroid[:, 1]}
+        columns |= {"v1": self.v[:, 0], "v2": self.v[:, 1]}
+        for i in (0, 1):
+            columns |= {f"R{i + 1}{j + 1}": self.response[:, i, j] for j in (0, 1)}
+        for name in QUANTITIES:
+            values = getattr(self, name)
+            columns |= {f"{name}{suffix}": values[:, k] for k, suffix in enumerate(FRAMES)}
+        return columns | {"flags": self.flags}
+
+    def to_table(self) -> Table:
+        """Return the result as an `astropy.table.Table`, with units and descriptions.
+
+        `meta["RSTEP"]` is the step, which `shear_from_responses` needs with the columns.
+        """
+        from astropy.table import Table
+
+        table = Table(self.to_numpy().to_columns())
+        for name in table.colnames:
+            table[name].unit, table[name].description = COLUMNS[name]
+        table.meta["RSTEP"] = self.step
+        return table
+
+
+def _columns() -> dict[str, tuple[str | None, str]]:
+    seen = {
+        "": "as seen",
+        "_1p": "with g1 = +h put on",
+        "_1m": "with g1 = -h put on",
+        "_2p": "with g2 = +h put on",
+        "_2m": "with g2 = -h put on",
+    }
+    columns: dict[str, tuple[str | None, str]] = {
+        "x": ("pix", "centroid along columns, 0-based, integer at pixel centres"),
+        "y": ("pix", "centroid along rows, 0-based, integer at pixel centres"),
+        "v1": (None, "normalised quadrupole, component along x"),
+        "v2": (None, "normalised quadrupole, component along the diagonal"),
+    }
+    for i in "12":
+        columns |= {f"R{i}{j}": (None, f"response of v{i} to the reduced shear g{j}") for j in "12"}
+    for name, unit, text in (
+        ("snr", None, "flux over its error"),
+        ("flux", None, "flux of a point under the weight, in units of the image"),
+        ("size", "pix", "sigma of the galaxy before the PSF"),
+    ):
+        columns |= {f"{name}{suffix}": (unit, f"{text}, {seen[suffix]}") for suffix in FRAMES}
+    return columns | {"flags": (None, "measurement flags, bits of fdnt_xp.flags.Flag")}
+
+
+COLUMNS: Final = _columns()
+"""Unit and description of every column of `ResponseResult.to_table`."""
+
+
+def measure_responses(
+    stamps: Array,
+    psf: Psf,
+    *,
+    noise_variance: float | Array | None = None,
+    noise_power: Array | None = None,
+    isotropise: bool | None = None,
+    seed: int = 0,
+    identifiers: Array | None = None,
+    noise_symmetry: Array | None = None,
+    size: float | None = None,
+    softening: float = 1.0,
+    step: float = 0.01,
+    padding: int = 1,
+    chunk_size: int | None = None,
+) -> ResponseResult:
+    """Measure each galaxy's quadrupole and its response to shear.
+
+    Parameters
+    ----------
+    stamps, psf, noise_variance, noise_power, isotropise, seed, identifiers, noise_symmetry
+        As for `population_null`.
+    size, softening, padding, chunk_size
+        As for `population_null`, statistic "frozen".
+    step : float
+        Reduced shear h of the frames, up to 0.1. The differences err by a part of order h².
+
+    Returns
+    -------
+    ResponseResult
+        A galaxy that is lost in some of the five frames counts 0 there, and is flagged
+        `LOST_IN_FRAME`.
+
+    Raises
+    ------
+    FdntValueError, RangeError, FdntTypeError, NamespaceError, ShapeMismatchError
+        As `population_null`; no stamps at all are allowed.
+    """
+    if not 0.0 < step <= _LARGEST_STEP:
+        raise RangeError("step", step, 0.0, _LARGEST_STEP)
+    sample = make_sample(
+        stamps,
+        psf,
+        statistic="frozen",
+        weight=None,
+        size=size,
+        softening=softening,
+        max_shear=step,
+        padding=padding,
+        chunk_size=chunk_size,
+        noise=NoiseOptions(
+            noise_variance=noise_variance,
+            noise_power=noise_power,
+            isotropise=isotropise,
+            seed=seed,
+            identifiers=identifiers,
+            symmetry=noise_symmetry,
+        ),
+    )
+    xp = array_namespace(stamps=stamps)
+    eta = 2.0 * math.atanh(step)
+    # To put shear on is to take the opposite shear off.
+    frames = ((0.0, 0.0), (-eta, 0.0), (eta, 0.0), (0.0, -eta), (0.0, eta))
+    seen = sample.evaluate(frames)
+    flags = _flags(sample.stamps, psf, seen)
+    measured = xp.bitwise_and(flags, xp.full_like(flags, int(FAILED))) == 0
+    slopes = [(seen[1 + 2 * j].v - seen[2 + 2 * j].v) / (2.0 * step) for j in (0, 1)]
+
+    def or_nan(column: Array) -> Array:
+        keep = xp.reshape(measured, (-1, *[1] * (column.ndim - 1)))
+        return xp.where(keep, column, xp.full_like(column, math.nan))
+
+    quantities = {
+        name: or_nan(xp.stack([getattr(one.quantities, name) for one in seen], axis=-1))
+        for name in QUANTITIES
+    }
+    ny, nx = (int(n) for n in sample.stamps.shape[1:])
+    middle = xp.asarray(
+        [0.5 * (nx - 1), 0.5 * (ny - 1)], dtype=seen[0].v.dtype, device=device_of(seen[0].v)
+    )
+    return ResponseResult(
+        v=or_nan(seen[0].v),
+        response=or_nan(xp.stack(slopes, axis=-1)),
+        centroid=or_nan(sample.job.length * seen[0].solution[:, -2:] + middle),
+        flags=flags,
+        step=step,
+        **quantities,
+    )
+
+
+def shear_from_responses(
+    responses: ResponseResult | Mapping[str, Any] | Table,
+    *,
+    cut: CutLike | None = None,
+    galaxy_weight: Array | None = None,
+) -> ShearEstimate:
+    """Estimate the shear of galaxies, or of those that pass a cut, from their responses.
+
+    Parameters
+    ----------
+    responses : ResponseResult, astropy.table.Table or mapping of arrays
+        From `measure_responses`, or the catalog of it: any rows of one.
+    cut : Cut, sequence of Cut, dict of (low, high), or callable, optional
+        As for `population_null`. It is applied in all five frames, so that its own
+        response to shear is included.
+    galaxy_weight : array, shape (n_gal,), optional
+        Multiplies what each galaxy counts. Not a function of anything that shear changes.
+
+    Returns
+    -------
+    ShearEstimate
+        `responsivity` is half the trace of the mean response.
+
+    Raises
+    ------
+    FdntValueError
+        If fewer than two galaxies are left, or they do not respond to shear.
+    FdntTypeError, ShapeMismatchError
+        If `responses` lacks a column, or `galaxy_weight` does not fit.
+
+    Notes
+    -----
+    `g = <R>⁻¹ <v>` is exact to second order in the shear: `m` is of order `g²/4`.
+    """
+    result = responses if isinstance(responses, ResponseResult) else _from_columns(responses)
+    xp = array_namespace(v=result.v)
+    selection = Selection.of(cut)
+    good = result.measured
+    frame_weights = [_frame_weight(result, selection, frame, good) for frame in range(len(FRAMES))]
+    if galaxy_weight is not None:
+        extra = _galaxy_weight(result, galaxy_weight)
+        frame_weights = [weight * extra for weight in frame_weights]
+    n_used = int(xp.count_nonzero(frame_weights[0] > 0))
+    if n_used < 2:
+        raise FdntValueError(
+            f"{n_used} of {result.n_gal} galaxies are measured"
+            f"{' and pass the cut' if selection.cuts else ''}; a shear needs two"
+        )
+    v = xp.where(good[:, None], result.v, xp.zeros_like(result.v))
+    slope = xp.where(good[:, None, None], result.response, xp.zeros_like(result.response))
+    response = []
+    for j in (0, 1):
+        plus, minus = frame_weights[1 + 2 * j], frame_weights[2 + 2 * j]
+        # The derivative of a product; the mean of plus and minus is v itself, to O(h²).
+        of_cut = v * ((plus - minus) / (2.0 * result.step))[:, None]
+        response.append(slope[:, :, j] * (0.5 * (plus + minus))[:, None] + of_cut)
+    each = xp.stack(response, axis=-1)
+    values = v * frame_weights[0][:, None]
+    mean_response = xp.mean(each, axis=0)
+    g = over_response(mean_response[None, :, :], xp.mean(values, axis=0)[None, :])[0, :]
+    if not bool(xp.all(xp.isfinite(g))):
+        raise FdntValueError("the mean of v does not respond to shear")
+    errors = ratio_errors(values, each)
+    return ShearEstimate(
+        # To third order what adds up is eta: 2 atanh g is what the frames are steps of.
+        g=reduced_shear_from_eta(2.0 * g),
+        g_err=errors[0],
+        n_used=n_used,
+        n_excluded=int(xp.count_nonzero(good)) - n_used,
+        method="responses",
+        g_err_jackknife=errors[1],
+        responsivity=float(0.5 * (mean_response[0, 0] + mean_response[1, 1])),
+    )
+
+
+def _flags(stamps: Array, psf: Psf, seen: list[FrameValues]) -> Array:
+    """Return why galaxies have no response, and which were lost in some frame."""
+    xp = array_namespace(stamps=stamps)
+    _, flags = screen(stamps, psf)
+    n_found = sum((xp.astype(one.found, xp.int32) for one in seen), xp.zeros_like(flags))
+    lost = (flags == 0) & (n_found < len(seen))
+    return flags + xp.astype(lost, xp.int32) * int(Flag.LOST_IN_FRAME)
+
+
+def _frame_weight(
+    result: ResponseResult, selection: Selection, frame: int, good: Array
+) -> Array:
+    """Return what each galaxy counts in one frame, shape (n_gal,)."""
+    xp = array_namespace(v=result.v)
+    if selection.cuts:
+        quantities = {name: getattr(result, name)[:, frame] for name in QUANTITIES}
+        weight = selection.weight(FrameQuantities(**quantities))
+    else:
+        weight = xp.ones_like(result.v[:, 0])
+    return xp.where(good, weight, xp.zeros_like(weight))
+
+
+def _galaxy_weight(result: ResponseResult, given: Array) -> Array:
+    xp = array_namespace(v=result.v, galaxy_weight=given)
+    given = as_floating(xp, given, "galaxy_weight")
+    require_dtype(result.v.dtype, galaxy_weight=given)
+    if given.shape != (result.n_gal,):
+        raise ShapeMismatchError(
+            f"galaxy_weight must have the shape ({result.n_gal},), not {tuple(given.shape)}"
+        )
+    if not bool(xp.all(xp.isfinite(given) & (given >= 0))):
+        raise FdntValueError("galaxy_weight must be finite and not negative")
+    return given
+
+
+def _from_columns(table: Mapping[str, Any] | Table) -> ResponseResult:
+    """Return the result whose columns a table or a mapping has."""
+    names = getattr(table, "colnames", None) or (list(table) if isinstance(table, Mapping) else None)
+    if names is None:
+        raise FdntTypeError(
+            "responses must be a ResponseResult, a table or a mapping of columns, not "
+            f"{type(table).__name__}"
+        )
+    missing = [name for name in COLUMNS if name not in names and name not in ("x", "y")]
+    if missing:
+        raise FdntTypeError(f"responses has no column {', '.join(missing)}")
+    columns = {name: _column(table[name]) for name in COLUMNS if name in names}
+    xp = array_namespace(v1=columns["v1"])
+    step = getattr(table, "meta", {}).get("RSTEP")
+    if step is None:
+        raise FdntTypeError('responses must tell the step of its frames in meta["RSTEP"]')
+
+    def rows(*names: str) -> Array:
+        return xp.stack([columns[name] for name in names], axis=-1)
+
+    quantities = {name: rows(*(name + suffix for suffix in FRAMES)) for name in QUANTITIES}
+    v = rows("v1", "v2")
+    return ResponseResult(
+        v=v,
+        response=xp.stack([rows("R11", "R12"), rows("R21", "R22")], axis=1),
+        centroid=rows("x", "y") if "x" in columns and "y" in columns else xp.full_like(v, math.nan),
+        flags=columns["flags"],
+        step=float(step),
+        **quantities,
+    )
+
+
+def _column(values: Any) -> Array:
+    """Return a column as an array; those of a table are of a class of their own."""
+    return np.asarray(values) if isinstance(values, np.ndarray) else values
