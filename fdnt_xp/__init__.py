@@ -10,11 +10,11 @@ from fdnt_xp.shapes.measure import measure_shapes as measure_shapes
 from fdnt_xp.shapes.results import ShapeResult as ShapeResult
 from fdnt_xp.shears.cuts import Cut as Cut
 from fdnt_xp.shears.estimate import ShearEstimate as ShearEstimate
+from fdnt_xp.shears.from_responses import shear_from_responses as shear_from_responses
 from fdnt_xp.shears.from_shapes import shear_from_shapes as shear_from_shapes
 from fdnt_xp.shears.population import population_null as population_null
 from fdnt_xp.shears.responses import ResponseResult as ResponseResult
 from fdnt_xp.shears.responses import measure_responses as measure_responses
-from fdnt_xp.shears.responses import shear_from_responses as shear_from_responses
 from fdnt_xp.shears.stacking import shear_from_stack as shear_from_stack
 
 __version__ = "0.1.0"

@@ -9,7 +9,14 @@ import pytest
 from array_api_extra.testing import assert_close
 
 import fdnt_xp as fx
-from fdnt_xp.errors import FdntTypeError, FdntValueError, RangeError, ShapeMismatchError
+from fdnt_xp.errors import (
+    FdntTypeError,
+    FdntValueError,
+    FdntWarning,
+    NamespaceError,
+    RangeError,
+    ShapeMismatchError,
+)
 from fdnt_xp.shear import shear_matrix
 from fdnt_xp.shears.population import find_null
 from fdnt_xp.shears.weights import ShapeWeight
@@ -198,6 +205,135 @@ def test_bad_arrays_are_refused_as_by_measure_shapes():
         fx.population_null(star(), psf)
     with pytest.raises(FdntTypeError, match="psf must be a Psf"):
         fx.population_null(ring(SHEAR), star())
+
+
+# --- noise ---------------------------------------------------------------------------
+
+
+def noisy(snr, n=64, seed=0):
+    """Return a lensed sample with noise, and the variance of a pixel."""
+    rng = np.random.default_rng(seed)
+    images = np.concatenate([ring(SHEAR, n=8, eta=0.5, start=s) for s in rng.uniform(0, 1, n // 8)])
+    sigma = math.sqrt(np.mean(np.sum(images**2, axis=(1, 2)))) / snr
+    return images + sigma * rng.standard_normal(images.shape), sigma**2
+
+
+@pytest.mark.parametrize("statistic", STATISTICS)
+def test_noisy_samples_on_every_library(statistic, psf, xp, dtype, to_xp, to_np):
+    stamps, variance = noisy(100.0)
+    options = {"statistic": statistic, "noise_variance": variance, "seed": 5}
+    host = fx.population_null(stamps, fx.Psf.from_image(star()), **options)
+    ours = fx.population_null(to_xp(stamps, dtype), psf, **options)
+    assert_close(ours.g, to_xp(host.g, dtype), **tolerance("noisy nulls", dtype), xp=xp)
+    assert np.all(np.abs(host.g - SHEAR) < 5.0 * host.g_err)
+
+
+def test_names_carry_the_noise_into_any_order_and_chunk():
+    stamps, variance = noisy(20.0)
+    psf, names = fx.Psf.from_image(star()), np.arange(64) + 2**40
+    order = np.random.default_rng(1).permutation(64)
+    options = {"noise_variance": variance, "seed": 2}
+    whole = fx.population_null(stamps, psf, identifiers=names, **options)
+    again = fx.population_null(
+        stamps[order], psf, identifiers=names[order], chunk_size=7, **options
+    )
+    # The search ends when a step is below a ten-thousandth of the error.
+    np.testing.assert_allclose(again.g, whole.g, atol=1e-3 * float(np.min(whole.g_err)))
+    other = fx.population_null(stamps, psf, identifiers=names, noise_variance=variance, seed=3)
+    assert np.all(np.abs(other.g - whole.g) > 1e-3 * whole.g_err)
+
+
+def test_a_variance_for_each_galaxy_and_a_white_spectrum_are_the_same():
+    stamps, variance = noisy(20.0)
+    psf = fx.Psf.from_image(star())
+    number = fx.population_null(stamps, psf, noise_variance=variance)
+    each = fx.population_null(stamps, psf, noise_variance=np.full(64, variance))
+    np.testing.assert_array_equal(each.g, number.g)
+    spectrum = np.full((48, 48), variance)
+    for power in (spectrum, np.stack([spectrum] * 64)):
+        white = fx.population_null(stamps, psf, noise_power=power, chunk_size=30)
+        np.testing.assert_allclose(white.g, number.g, atol=1e-9)
+
+
+def test_a_large_sample_begins_with_a_part_of_it(monkeypatch):
+    stamps, variance = noisy(20.0)
+    psf = fx.Psf.from_image(star())
+    whole = fx.population_null(stamps, psf, noise_variance=variance)
+    monkeypatch.setattr("fdnt_xp.shears.population._PILOT", 16)
+    begun = fx.population_null(stamps, psf, noise_variance=variance)
+    np.testing.assert_allclose(begun.g, whole.g, atol=1e-3 * float(np.min(whole.g_err)))
+    # The response is taken where the part's null is.
+    np.testing.assert_allclose(begun.g_err, whole.g_err, rtol=0.05)
+
+
+def test_the_error_that_the_noise_power_brings():
+    stamps, variance = noisy(10.0, n=400)
+    psf = fx.Psf.from_image(star())
+    estimate = fx.population_null(stamps, psf, noise_variance=variance, noise_error=0.2)
+    told = [
+        fx.population_null(stamps, psf, noise_variance=variance * factor).g for factor in (0.8, 1.2)
+    ]
+    np.testing.assert_allclose(estimate.g_err_noise_power, np.abs(told[1] - told[0]) / 2, rtol=0.3)
+    none = fx.population_null(stamps, psf, noise_variance=variance)
+    assert none.g_err_noise_power is None
+    assert set(estimate.to_dict()) - set(none.to_dict()) == {
+        "g1_err_noise_power",
+        "g2_err_noise_power",
+    }
+
+
+def test_a_cut_leaves_some_out():
+    stamps, variance = noisy(20.0)
+    psf = fx.Psf.from_image(star())
+    result = fx.measure_responses(stamps, psf, noise_variance=variance)
+    middle = float(np.median(result.snr[:, 0]))
+    cut = fx.population_null(stamps, psf, noise_variance=variance, cut={"snr": (middle, None)})
+    assert cut.n_used + cut.n_excluded == 64
+    assert 20 < cut.n_used < 44
+    with pytest.raises(FdntValueError, match="the cut keeps 0 of 64 galaxies"):
+        fx.population_null(stamps, psf, noise_variance=variance, cut={"snr": (1e6, None)})
+
+
+def test_eta_at_low_snr_is_warned_of():
+    stamps, variance = noisy(30.0)
+    psf = fx.Psf.from_image(star())
+    with pytest.warns(FdntWarning, match="below an S/N of 50"):
+        fx.population_null(stamps, psf, noise_variance=variance, statistic="eta", max_shear=0.3)
+
+
+def test_a_shear_beyond_the_margin_widens_it():
+    images, psf = ring((0.12, 0.0)), fx.Psf.from_image(star())
+    found = fx.population_null(images, psf)
+    given = fx.population_null(images, psf, max_shear=0.3)
+    np.testing.assert_array_equal(found.g, given.g)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"isotropise": True}, FdntValueError, "isotropise needs noise_variance or noise_power"),
+        ({"noise_variance": 0, "isotropise": True}, FdntValueError, "there is no noise to make"),
+        ({"noise_variance": -1.0}, RangeError, "noise_variance = -1"),
+        ({"noise_variance": math.nan}, RangeError, "noise_variance = nan"),
+        ({"noise_variance": np.ones(3)}, ShapeMismatchError, r"have the shape \(8,\)"),
+        ({"noise_variance": -np.ones(8)}, FdntValueError, "finite and not negative"),
+        ({"noise_variance": np.full(8, np.nan)}, FdntValueError, "finite and not negative"),
+        ({"noise_variance": np.ones(8, np.float32)}, NamespaceError, "dtype"),
+        ({"noise_power": np.ones((4, 4))}, ShapeMismatchError, r"noise_power must have the shape"),
+        ({"noise_power": -np.ones((48, 48))}, FdntValueError, "not negative"),
+        ({"noise_power": np.arange(48.0**2).reshape(48, 48)}, FdntValueError, "k and -k"),
+        ({"noise_power": np.ones((48, 48)), "noise_variance": 1.0}, FdntValueError, "not both"),
+        ({"noise_variance": 1.0, "identifiers": np.ones(8)}, FdntTypeError, "whole numbers"),
+        ({"noise_variance": 1.0, "identifiers": np.arange(3)}, ShapeMismatchError, "identifiers"),
+        ({"noise_error": -0.1}, RangeError, "noise_error = -0.1"),
+        ({"softening": -1.0}, RangeError, "softening = -1"),
+        ({"cut": {"snr": (5.0, None)}}, FdntValueError, "a cut on snr needs"),
+        ({"cut": 3}, FdntTypeError, "cut must be"),
+    ],
+)
+def test_noise_that_makes_no_sense(options, error, message):
+    with pytest.raises(error, match=message):
+        fx.population_null(ring(SHEAR), fx.Psf.from_image(star()), **options)
 
 
 # --- the search ----------------------------------------------------------------------

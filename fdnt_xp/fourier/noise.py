@@ -18,13 +18,14 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fdnt_xp.arrays import Array, array_namespace, device_of
 from fdnt_xp.fourier.deviates import unit_deviates
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.interpolation import cubic_table
 from fdnt_xp.fourier.psf import Psf, power_on_circles, transform_on_modes
-from fdnt_xp.fourier.transform import DeconvolvedStamps
+from fdnt_xp.fourier.transform import DeconvolvedStamps, complex_like
 
 _RADII, _ANGLES = 41, 32
 """Of the polar table of ln V: circles, and points on half of each. In the angle it is a
@@ -68,7 +69,7 @@ class PixelNoise:
         n_power, ny, nx = power.shape
         variance = xp.mean(xp.reshape(power, (n_power, -1)), axis=-1)
         half = power[:, :, : nx // 2 + 1] / variance[:, None, None]
-        lags = xp.fft.irfftn(xp.astype(half, _complex_of(xp, power)), s=(ny, nx), axes=(-2, -1))
+        lags = xp.fft.irfftn(complex_like(half), s=(ny, nx), axes=(-2, -1))
         return cls(
             variance=xp.broadcast_to(variance, (n_gal,)),
             correlation=xp.roll(lags, (ny // 2, nx // 2), axis=(-2, -1)),
@@ -76,11 +77,15 @@ class PixelNoise:
 
     def rows(self, rows: slice) -> PixelNoise:
         """Return the noise of a range of galaxies."""
-        shared = self.correlation is None or int(self.correlation.shape[0]) == 1
-        return PixelNoise(
-            variance=self.variance[rows],
-            correlation=self.correlation if shared else self.correlation[rows, :, :],
-        )
+        correlation = self.correlation
+        if correlation is not None and int(correlation.shape[0]) > 1:
+            correlation = correlation[rows, :, :]
+        return PixelNoise(variance=self.variance[rows], correlation=correlation)
+
+    @property
+    def shared(self) -> bool:
+        """Whether all galaxies have noise of one shape, whatever its variance."""
+        return self.correlation is None or int(self.correlation.shape[0]) == 1
 
     def scaled(self, factor: float) -> PixelNoise:
         """Return the noise with its power multiplied."""
@@ -92,13 +97,6 @@ class PixelNoise:
         if self.correlation is None:
             return xp.ones_like(grid.kx)[None, :]
         return xp.abs(transform_on_modes(self.correlation, grid, 1.0))
-
-    def relative_power_on_circles(self, radii: Array, n_angle: int) -> Array | None:
-        """Return the same on circles, (n_power, n_radius, n_angle); None where it is 1."""
-        if self.correlation is None:
-            return None
-        xp = array_namespace(radii=radii)
-        return xp.sqrt(power_on_circles(self.correlation, radii, n_angle, 1.0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,27 +134,18 @@ class DeconvolvedNoise:
             `psf.inverse_transfer(grid)`.
         """
         xp = array_namespace(kmax=psf.kmax)
-        n_modes = float(grid.shape[0] * grid.shape[1])
+        n_power = 1 if pixels.correlation is None else int(pixels.correlation.shape[0])
         inverse_power = xp.real(inverse_transfer) ** 2 + xp.imag(inverse_transfer) ** 2
-        t = xp.linspace(0.0, 1.0, _RADII, dtype=psf.kmax.dtype, device=device_of(psf.kmax))
-        tables = []
+        n_modes = float(grid.shape[0] * grid.shape[1])
+        if n_power > psf.n_psf:
+            psf = psf.take(xp.zeros_like(pixels.variance, dtype=xp.int64))
+        parts = []
         for first in range(0, psf.n_psf, _PSFS_AT_ONCE):
             rows = slice(first, min(first + _PSFS_AT_ONCE, psf.n_psf))
-            radii = psf.kmax[rows, None] * t[None, :]
-            transfer = power_on_circles(psf.image[rows, :, :], radii, _ANGLES, psf.oversampling)
-            # A PSF without light at some k ends there; the tiny number only spares the log.
-            smallest = xp.full_like(transfer, float(xp.finfo(transfer.dtype).smallest_normal))
-            ln_polar = -xp.log(xp.maximum(transfer, smallest))
-            own = pixels.correlation is not None and int(pixels.correlation.shape[0]) > 1
-            relative = (pixels.rows(rows) if own else pixels).relative_power_on_circles(
-                radii, _ANGLES
-            )
-            if relative is not None:
-                ln_polar = ln_polar + xp.log(xp.maximum(relative, smallest[:1, :, :]))
-            tables.append(ln_polar + math.log(n_modes))
+            parts.append(_ln_polar(psf, pixels, rows) + math.log(n_modes))
         return cls(
             power=n_modes * pixels.relative_power(grid) * inverse_power,
-            ln_polar=xp.concat(tables, axis=0),
+            ln_polar=xp.concat(parts, axis=0),
             kmax=psf.kmax,
         )
 
@@ -232,9 +221,29 @@ class RoundNoise:
         """Return the galaxies with noise of a missing power, shape (n_psf, n_k), added."""
         xp = array_namespace(missing=missing)
         scale = xp.sqrt(xp.maximum(missing, xp.zeros_like(missing)))
-        return DeconvolvedStamps(
-            re=galaxies.re + scale * self.re, im=galaxies.im + scale * self.im
-        )
+        return DeconvolvedStamps(re=galaxies.re + scale * self.re, im=galaxies.im + scale * self.im)
+
+
+def _ln_polar(psf: Psf, pixels: PixelNoise, rows: slice) -> Array:
+    """Return ln P/|T|² on the circles of some PSFs, shape (n_psf, n_radius, n_angle)."""
+    xp = array_namespace(kmax=psf.kmax)
+    t = xp.linspace(0.0, 1.0, _RADII, dtype=psf.kmax.dtype, device=device_of(psf.kmax))
+    radii = psf.kmax[rows, None] * t[None, :]
+    ratio = 1.0 / _positive(
+        power_on_circles(psf.image[rows, :, :], radii, _ANGLES, psf.oversampling)
+    )
+    correlation = pixels.correlation
+    if correlation is not None:
+        mine = correlation if int(correlation.shape[0]) == 1 else correlation[rows, :, :]
+        ratio = ratio * xp.sqrt(power_on_circles(mine, radii, _ANGLES, 1.0))
+    return xp.log(_positive(ratio))
+
+
+def _positive(values: Array) -> Array:
+    """Return values without zeros, for whose logarithms nothing is left."""
+    xp = array_namespace(values=values)
+    smallest = float(xp.finfo(values.dtype).smallest_normal)
+    return xp.maximum(values, xp.full_like(values, smallest))
 
 
 def _turned(re: Array, im: Array, grid: KGrid, symmetry: Array) -> tuple[Array, Array]:
@@ -249,7 +258,7 @@ def _turned(re: Array, im: Array, grid: KGrid, symmetry: Array) -> tuple[Array, 
     return re, im
 
 
-def _sheared_back(gamma: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+def _sheared_back(gamma: tuple[float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return length and angle of `S_gamma⁻¹ (cosθ, sinθ)` over the directions θ."""
     theta = np.pi * (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS
     half = 0.5 * math.hypot(*gamma)
@@ -260,14 +269,10 @@ def _sheared_back(gamma: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
     return np.hypot(x, y), np.arctan2(y, x)
 
 
-def _interpolation(target: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+def _interpolation(target: NDArray[np.float64], nodes: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the matrix, (n_node, n_target), of trigonometric interpolation of period π."""
     n = len(nodes)
     offset = target[None, :] - nodes[:, None]
     at_node = np.abs(np.sin(offset)) < 1e-12
     tangent = np.where(at_node, 1.0, np.tan(offset))
     return np.where(at_node, 1.0, np.sin(n * offset) / (n * tangent))
-
-
-def _complex_of(xp, array: Array):
-    return xp.complex64 if array.dtype == xp.float32 else xp.complex128

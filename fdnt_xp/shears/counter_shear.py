@@ -26,9 +26,7 @@ from fdnt_xp.shears.weights import ShapeWeight
 
 _OPTIONS: Final = DoglegOptions(max_iter=30, initial_radius=1.0, max_radius=3.0)
 """Radii in `|eta|` and in the length unit of centroids."""
-_CENTROID_OPTIONS: Final = DoglegOptions(
-    ftol=1e-4, max_iter=30, initial_radius=1.0, max_radius=3.0
-)
+_CENTROID_OPTIONS: Final = DoglegOptions(ftol=1e-4, max_iter=30, initial_radius=1.0, max_radius=3.0)
 """A last step of Newton's, taken on the moments alone, squares what ftol leaves."""
 
 

@@ -94,7 +94,9 @@ class Cut:
 
 
 CutFunction: TypeAlias = Callable[[FrameQuantities], Array]
-CutLike: TypeAlias = Cut | Sequence[Cut] | Mapping[str, tuple[float | None, float | None]] | CutFunction
+CutLike: TypeAlias = (
+    Cut | Sequence[Cut] | Mapping[str, tuple[float | None, float | None]] | CutFunction
+)
 """A cut, several that must all be passed, ranges by name of the quantity, or a function."""
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from fdnt_xp.arrays import Array, to_numpy
 from fdnt_xp.shear import eta_from_reduced_shear
@@ -68,7 +68,7 @@ class ShearEstimate:
 
     def to_numpy(self) -> ShearEstimate:
         """Return the same estimate with NumPy arrays, copied to the host."""
-        arrays = {
+        arrays: dict[str, Any] = {
             field.name: to_numpy(value)
             for field in fields(self)
             if field.name.startswith("g") and (value := getattr(self, field.name)) is not None

@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TypeAlias
 
 from fdnt_xp.arrays import Array, array_namespace, device_of
+from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.noise import DeconvolvedNoise, PixelNoise, RoundNoise
 from fdnt_xp.fourier.transform import DeconvolvedStamps, deconvolve
 from fdnt_xp.shapes.centroid import starting_centroid, wide_weight
 from fdnt_xp.shapes.job import Job, screen
 from fdnt_xp.shears.counter_shear import FrameNoise, FrameValues, Statistic, in_new_frame
-from fdnt_xp.shears.cuts import FrameQuantities
+from fdnt_xp.shears.cuts import QUANTITIES, FrameQuantities
 
 Gamma: TypeAlias = tuple[float, float]
 """A trial shear, eta-type."""
@@ -44,6 +46,14 @@ class SampleNoise:
     identifiers: Array
     seed: int
     symmetry: Array | None = None
+
+    def draw(self, grid: KGrid) -> RoundNoise | None:
+        """Draw the synthetic noise, if it is wanted."""
+        if not self.isotropise:
+            return None
+        return RoundNoise.draw(
+            self.identifiers, self.seed, self.pixels.variance, grid, self.symmetry
+        )
 
     def rows(self, rows: slice) -> SampleNoise:
         """Return the noise of a range of galaxies."""
@@ -111,7 +121,8 @@ class FrameSample:
         Galaxies that cannot be measured at all are not `found`.
         """
         parts: list[list[FrameValues]] = [[] for _ in gammas]
-        for first in range(0, self.n_gal, self.chunk_size):
+        # An empty sample still has its one chunk, of no rows.
+        for first in range(0, max(self.n_gal, 1), self.chunk_size):
             rows = slice(first, min(first + self.chunk_size, self.n_gal))
             for of_frame, values in zip(parts, self._evaluate_chunk(rows, gammas), strict=True):
                 of_frame.append(values)
@@ -122,20 +133,34 @@ class FrameSample:
         job = self.job.rows(rows)
         grid = job.coarse
         like = {"dtype": self.stamps.dtype, "device": device_of(self.stamps)}
+        noise = None if self.noise is None else self.noise.rows(rows)
         stamps, flags = screen(self.stamps[rows, :, :], job.psf)
-        inverse_transfer = job.psf.inverse_transfer(grid)
-        galaxies = deconvolve(stamps, inverse_transfer, grid)
-        view = _NoiseOfChunk.of(self.noise, rows, job, inverse_transfer)
+        optics = self._shared_optics or _Optics.of(job, noise)
+        galaxies = deconvolve(stamps, optics.inverse_transfer, grid)
+        synthetic = None if noise is None else noise.draw(grid)
         frame, start = self._solutions.get(rows.start) or ((0.0, 0.0), self._start(job, galaxies))
         weight = job.weight.shrunk(self.reach)
         for gamma in gammas:
             sheared = grid.sheared(xp.asarray(gamma, **like))
             start = in_new_frame(start, grid.sheared(xp.asarray(frame, **like)), sheared)
-            seen, noise = view.in_frame(galaxies, sheared, gamma, self.reach)
-            values = self.statistic.evaluate(sheared, seen, weight, start, noise)
+            seen, frame_noise = galaxies, None
+            if noise is not None and optics.noise is not None:
+                power = optics.noise.power
+                if synthetic is not None:
+                    power = optics.noise.made_round(sheared, gamma, self.reach)
+                    seen = synthetic.added_to(galaxies, power - optics.noise.power)
+                frame_noise = FrameNoise(power=power, variance=noise.pixels.variance)
+            values = self.statistic.evaluate(sheared, seen, weight, start, frame_noise)
             frame, start = gamma, values.solution
             yield _only_where(values, flags == 0)
         self._solutions[rows.start] = (frame, start)
+
+    @cached_property
+    def _shared_optics(self) -> _Optics | None:
+        """What all galaxies share, if they do."""
+        if self.job.weight.shared and (self.noise is None or self.noise.pixels.shared):
+            return _Optics.of(self.job, self.noise)
+        return None
 
     def _start(self, job: Job, galaxies: DeconvolvedStamps) -> Array:
         """Return a first guess in the frame of the image."""
@@ -151,50 +176,19 @@ class FrameSample:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _NoiseOfChunk:
-    """The noise of one chunk, ready for any frame; empty where it is unknown."""
+class _Optics:
+    """What division by the transfer function does to galaxies and to their noise."""
 
-    pixels: PixelNoise | None
-    deconvolved: DeconvolvedNoise | None
-    synthetic: RoundNoise | None
+    inverse_transfer: Array
+    noise: DeconvolvedNoise | None
 
     @classmethod
-    def of(
-        cls, noise: SampleNoise | None, rows: slice, job: Job, inverse_transfer: Array
-    ) -> _NoiseOfChunk:
+    def of(cls, job: Job, noise: SampleNoise | None) -> _Optics:
+        inverse_transfer = job.psf.inverse_transfer(job.coarse)
         if noise is None:
-            return cls(pixels=None, deconvolved=None, synthetic=None)
-        mine = noise.rows(rows)
-        return cls(
-            pixels=mine.pixels,
-            deconvolved=DeconvolvedNoise.behind(
-                job.psf, mine.pixels, job.coarse, inverse_transfer
-            ),
-            synthetic=RoundNoise.draw(
-                mine.identifiers,
-                mine.seed,
-                mine.pixels.variance,
-                job.coarse,
-                mine.symmetry,
-            )
-            if mine.isotropise
-            else None,
-        )
-
-    def in_frame(
-        self, galaxies: DeconvolvedStamps, grid: object, gamma: Gamma, reach: float
-    ) -> tuple[DeconvolvedStamps, FrameNoise | None]:
-        """Return the galaxies with their noise made round, and what it then is."""
-        if self.pixels is None or self.deconvolved is None:
-            return galaxies, None
-        power = self.deconvolved.power
-        if self.synthetic is not None:
-            xp = array_namespace(power=power)
-            wanted = self.deconvolved.made_round(grid, gamma, reach)
-            missing = xp.where(power > 0, wanted - power, xp.zeros_like(power))
-            galaxies = self.synthetic.added_to(galaxies, missing)
-            power = wanted
-        return galaxies, FrameNoise(power=power, variance=self.pixels.variance)
+            return cls(inverse_transfer=inverse_transfer, noise=None)
+        deconvolved = DeconvolvedNoise.behind(job.psf, noise.pixels, job.coarse, inverse_transfer)
+        return cls(inverse_transfer=inverse_transfer, noise=deconvolved)
 
 
 def _only_where(values: FrameValues, usable: Array) -> FrameValues:
@@ -204,7 +198,7 @@ def _only_where(values: FrameValues, usable: Array) -> FrameValues:
     def masked(column: Array) -> Array:
         return xp.where(usable, column, xp.full_like(column, math.nan))
 
-    quantities = {f.name: masked(getattr(values.quantities, f.name)) for f in fields(FrameQuantities)}
+    quantities = {name: masked(getattr(values.quantities, name)) for name in QUANTITIES}
     return FrameValues(
         v=xp.where(usable[:, None], values.v, xp.zeros_like(values.v)),
         found=values.found & usable,
@@ -220,8 +214,7 @@ def _joined(parts: list[FrameValues]) -> FrameValues:
         return xp.concat([getattr(part, name) for part in parts], axis=0)
 
     quantities = {
-        f.name: xp.concat([getattr(part.quantities, f.name) for part in parts])
-        for f in fields(FrameQuantities)
+        name: xp.concat([getattr(part.quantities, name) for part in parts]) for name in QUANTITIES
     }
     return FrameValues(
         v=column("v"),

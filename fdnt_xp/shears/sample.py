@@ -77,7 +77,7 @@ def make_sample(
         raise FdntValueError('weight goes with statistic="eta"; "frozen" is bounded by itself')
     if not (math.isfinite(softening) and softening >= 0.0):
         raise RangeError("softening", softening, 0.0, None)
-    sample_noise = _sample_noise(xp, stamps, psf, padding, noise)
+    sample_noise = _sample_noise(xp, stamps, noise)
     noisy = sample_noise is not None
     job = prepare(xp, stamps, psf.ending_at(_NOISY_FLOOR) if noisy else psf, padding, size, 0)
     frozen_size = size or _FROZEN_SIZE * 3.0 / psf.largest_kmax
@@ -108,9 +108,7 @@ def make_sample(
     )
 
 
-def _sample_noise(
-    xp: ModuleType, stamps: Array, psf: Psf, padding: int, options: NoiseOptions
-) -> SampleNoise | None:
+def _sample_noise(xp: ModuleType, stamps: Array, options: NoiseOptions) -> SampleNoise | None:
     """Return what is known of the noise, or None."""
     n_gal = int(stamps.shape[0])
     if options.noise_variance is not None and options.noise_power is not None:
@@ -190,9 +188,7 @@ def _correlated(xp: ModuleType, stamps: Array, power: Array) -> PixelNoise:
     return PixelNoise.of_power(power, n_gal)
 
 
-def _whole_numbers(
-    xp: ModuleType, stamps: Array, name: str, given: Array | None
-) -> Array | None:
+def _whole_numbers(xp: ModuleType, stamps: Array, name: str, given: Array | None) -> Array | None:
     """Return an integer of each galaxy as int64, or None."""
     if given is None:
         return None
