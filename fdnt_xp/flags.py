@@ -47,9 +47,15 @@ class Flag(IntFlag):
     """The position that was given is not on the image, or not a number."""
     LOST_IN_FRAME = 1 << 21
     """No centroid was found in one of the counter-sheared frames, where the galaxy counts 0."""
+    MASKED = 1 << 22
+    """Pixels are missing, too many to be filled or not to be filled."""
+    FILLED = 1 << 23
+    """Missing pixels were filled from the others."""
 
 
-INFORMATION: Final = Flag.SIZE_AT_BOUND | Flag.SIZE_FIXED | Flag.FINE_GRID | Flag.LOST_IN_FRAME
+INFORMATION: Final = (
+    Flag.SIZE_AT_BOUND | Flag.SIZE_FIXED | Flag.FINE_GRID | Flag.LOST_IN_FRAME | Flag.FILLED
+)
 """Bits that tell how a shape was measured; it may be used all the same."""
 
 FAILED: Final = ~INFORMATION & Flag(sum(int(flag) for flag in Flag))
@@ -90,4 +96,6 @@ _TEXT: Final[dict[str, str]] = {
     "FINE_GRID": "measured on the zero-padded k grid",
     "OFF_IMAGE": "position not on the image",
     "LOST_IN_FRAME": "no centroid in a counter-sheared frame",
+    "MASKED": "pixels missing",
+    "FILLED": "missing pixels filled from the others",
 }

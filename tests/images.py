@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+
+from fdnt_xp.shear import shear_matrix
 
 
 def gaussian_image(
@@ -52,3 +56,35 @@ def galaxies(
             for one, c in zip(e, map(tuple, centres), strict=True)
         ]
     )
+
+
+SHEAR = np.array([0.03, -0.02])
+"""A reduced shear for rings."""
+
+
+def eta_of(g: tuple[float, float]) -> np.ndarray:
+    """Return the conformal shear of a reduced shear."""
+    g = np.asarray(g)
+    norm = np.linalg.norm(g)
+    return 2.0 * math.atanh(norm) * g / norm if norm else np.zeros(2)
+
+
+def ring(
+    g: tuple[float, float],
+    *,
+    n: int = 8,
+    eta: float = 0.7,
+    sigma: float = 2.2,
+    start: float = 0.1,
+    shape: tuple[int, int] = (48, 48),
+) -> np.ndarray:
+    """Return elliptical Gaussians at n position angles, lensed by g, behind the PSF of `star`."""
+    lens = shear_matrix(eta_of(g))
+    images = []
+    for angle in start + np.pi * np.arange(n) / n:
+        intrinsic = shear_matrix(eta * np.array([np.cos(2 * angle), np.sin(2 * angle)]))
+        distortion = lens @ intrinsic
+        # A round Gaussian distorted by M has the covariance M Mᵀ.
+        covariance = sigma**2 * distortion @ distortion.T + PSF_COVARIANCE
+        images.append(gaussian_image(covariance, shape, centre=(0.3 * np.cos(5 * angle), 0.2)))
+    return np.stack(images)

@@ -17,33 +17,12 @@ from fdnt_xp.errors import (
     RangeError,
     ShapeMismatchError,
 )
-from fdnt_xp.shear import shear_matrix
 from fdnt_xp.shears.population import find_null
 from fdnt_xp.shears.weights import ShapeWeight
-from images import PSF_COVARIANCE, gaussian_image, star
+from images import SHEAR, ring, star
 from tolerances import tolerance
 
 STATISTICS = ["frozen", "eta"]
-SHEAR = np.array([0.03, -0.02])
-
-
-def eta_of(g):
-    g = np.asarray(g)
-    norm = np.linalg.norm(g)
-    return 2.0 * math.atanh(norm) * g / norm if norm else np.zeros(2)
-
-
-def ring(g, *, n=8, eta=0.7, sigma=2.2, start=0.1, shape=(48, 48)):
-    """Return elliptical Gaussians at n position angles, lensed by g, behind the PSF of `star`."""
-    lens = shear_matrix(eta_of(g))
-    images = []
-    for angle in start + np.pi * np.arange(n) / n:
-        intrinsic = shear_matrix(eta * np.array([np.cos(2 * angle), np.sin(2 * angle)]))
-        distortion = lens @ intrinsic
-        # A round Gaussian distorted by M has the covariance M Mᵀ.
-        covariance = sigma**2 * distortion @ distortion.T + PSF_COVARIANCE
-        images.append(gaussian_image(covariance, shape, centre=(0.3 * np.cos(5 * angle), 0.2)))
-    return np.stack(images)
 
 
 @pytest.fixture

@@ -20,8 +20,7 @@ from fdnt_xp.errors import (
 from fdnt_xp.flags import Flag
 from fdnt_xp.shears.cuts import FrameQuantities
 from fdnt_xp.shears.responses import COLUMNS, FRAMES
-from images import PSF_COVARIANCE, gaussian_image, star
-from test_population import ring
+from images import PSF_COVARIANCE, gaussian_image, ring, star
 from tolerances import tolerance
 
 SHEAR = np.array([0.02, -0.01])
@@ -177,7 +176,9 @@ def test_errors_are_those_of_the_ratio():
     result = result.take(np.random.default_rng(1).permutation(400))
     estimate = fx.shear_from_responses(result)
     np.testing.assert_allclose(estimate.g_err_jackknife, estimate.g_err, rtol=0.3)
-    parts = [fx.shear_from_responses(result.take(np.arange(20 * i, 20 * i + 20))).g for i in range(20)]
+    parts = [
+        fx.shear_from_responses(result.take(np.arange(20 * i, 20 * i + 20))).g for i in range(20)
+    ]
     scatter = np.std(parts, axis=0, ddof=1) / math.sqrt(20)
     # Twenty parts of two components fix their scatter to 11 %.
     ratio = np.sqrt(np.mean((scatter / estimate.g_err) ** 2))

@@ -33,7 +33,7 @@ def unit_deviates(
 
     Parameters
     ----------
-    identifiers : array of int64, shape (n_gal,)
+    identifiers : array of int64 or int32, shape (n_gal,)
         Names of the galaxies as numbers; galaxies of one name have the same deviates.
     modes : array of integers, shape (n_k,)
         Numbers of the modes, not negative and below 2³¹.
@@ -94,8 +94,10 @@ def _seed_words(seed: int) -> tuple[int, int]:
 
 
 def _words(number: Array) -> tuple[Array, Array]:
-    """Return the low and the high 32 bits of int64 numbers, as int32."""
+    """Return the low and the high 32 bits of whole numbers, as int32."""
     xp = array_namespace(number=number)
+    if number.dtype == xp.int32:  # all that JAX has without float64
+        return number, number >> 31
     high = number >> 32
     low = number & 0xFFFFFFFF
     low = xp.where(low >= 1 << 31, low - (1 << 32), low)

@@ -34,6 +34,8 @@ _DIRECTIONS: Final = 64
 """Over half a turn, among which the largest V is sought."""
 _MARGIN: Final = 0.004
 """By which V_iso lies above the largest V found, for what lies between the directions."""
+_LEAST_POWER: Final = 1e-3
+"""Of the variance: least power of correlated noise that is told from none."""
 _PSFS_AT_ONCE: Final = 64
 """Bounds the memory of the trigonometric sums."""
 
@@ -229,21 +231,17 @@ def _ln_polar(psf: Psf, pixels: PixelNoise, rows: slice) -> Array:
     xp = array_namespace(kmax=psf.kmax)
     t = xp.linspace(0.0, 1.0, _RADII, dtype=psf.kmax.dtype, device=device_of(psf.kmax))
     radii = psf.kmax[rows, None] * t[None, :]
-    ratio = 1.0 / _positive(
-        power_on_circles(psf.image[rows, :, :], radii, _ANGLES, psf.oversampling)
-    )
+    transfer = power_on_circles(psf.image[rows, :, :], radii, _ANGLES, psf.oversampling)
+    # Within the disc |T|² is above the floor of 𝒯; outside, or for a bad PSF, it may be 0.
+    smallest = float(xp.finfo(transfer.dtype).smallest_normal)
+    ratio = 1.0 / xp.maximum(transfer, xp.full_like(transfer, smallest))
     correlation = pixels.correlation
     if correlation is not None:
         mine = correlation if int(correlation.shape[0]) == 1 else correlation[rows, :, :]
-        ratio = ratio * xp.sqrt(power_on_circles(mine, radii, _ANGLES, 1.0))
-    return xp.log(_positive(ratio))
-
-
-def _positive(values: Array) -> Array:
-    """Return values without zeros, for whose logarithms nothing is left."""
-    xp = array_namespace(values=values)
-    smallest = float(xp.finfo(values.dtype).smallest_normal)
-    return xp.maximum(values, xp.full_like(values, smallest))
+        relative = xp.sqrt(power_on_circles(mine, radii, _ANGLES, 1.0))
+        # A mode without noise, as k = 0 of an image less its mean, has no logarithm.
+        ratio = ratio * xp.maximum(relative, xp.full_like(relative, _LEAST_POWER))
+    return xp.log(ratio)
 
 
 def _turned(re: Array, im: Array, grid: KGrid, symmetry: Array) -> tuple[Array, Array]:

@@ -188,9 +188,6 @@ class Psf:
 def transform_on_modes(image: Array, grid: KGrid, oversampling: float) -> Array:
     """Return the transform of images, about the middle of their arrays, on a grid's modes.
 
-    `exp(-i k.x)` separates, `T = along_y @ image @ along_xᵀ` on the whole half plane, so
-    the direct sums are two matrix products.
-
     Parameters
     ----------
     image : array, shape (n_psf, ny, nx)
@@ -202,13 +199,22 @@ def transform_on_modes(image: Array, grid: KGrid, oversampling: float) -> Array:
     array, shape (n_psf, n_k), complex
     """
     xp = array_namespace(image=image)
+    return xp.take(half_plane_transform(image, grid, oversampling), grid.index, axis=1)
+
+
+def half_plane_transform(image: Array, grid: KGrid, oversampling: float) -> Array:
+    """Return the same on all modes of the grid's `rfftn`, shape (n_psf, n_half_plane).
+
+    `exp(-i k.x)` separates, `T = along_y @ image @ along_xᵀ`, so the direct sums are two
+    matrix products.
+    """
+    xp = array_namespace(image=image)
     n_psf, ny, nx = image.shape
     kx, ky = half_plane_axes(grid)
     along_x, along_y = _waves(kx, nx, oversampling), _waves(ky, ny, oversampling)
     image = xp.astype(image, along_x.dtype)
     half_plane = xp.matmul(xp.matmul(along_y, image), xp.matrix_transpose(along_x))
-    half_plane = xp.reshape(half_plane, (n_psf, grid.n_half_plane))
-    return xp.take(half_plane, grid.index, axis=1)
+    return xp.reshape(half_plane, (n_psf, grid.n_half_plane))
 
 
 def _normalised(image: Array) -> tuple[Array, Array]:

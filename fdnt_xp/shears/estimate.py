@@ -36,6 +36,9 @@ class ShearEstimate:
     n_excluded : int
         Galaxies that were left out; the warning that comes with it says why. Those that
         have no shape to begin with are not counted.
+    n_masked, n_filled : int
+        Galaxies with missing pixels: left out, a part of `n_excluded`; and used, with the
+        pixels filled from the others.
     g_err_noise : array, shape (2,), optional
         Standard error from the noise of the pixels alone; NaN where the noise is unknown.
         It is a part of `g_err`, not an addition to it.
@@ -55,6 +58,8 @@ class ShearEstimate:
     n_used: int
     method: str
     n_excluded: int = 0
+    n_masked: int = 0
+    n_filled: int = 0
     g_err_noise: Array | None = None
     g_err_jackknife: Array | None = None
     g_err_noise_power: Array | None = None

@@ -13,6 +13,7 @@ from functools import cached_property
 from typing import TypeAlias
 
 from fdnt_xp.arrays import Array, array_namespace, device_of
+from fdnt_xp.flags import FAILED, Flag
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.noise import DeconvolvedNoise, PixelNoise, RoundNoise
 from fdnt_xp.fourier.transform import DeconvolvedStamps, deconvolve
@@ -20,6 +21,7 @@ from fdnt_xp.shapes.centroid import starting_centroid, wide_weight
 from fdnt_xp.shapes.job import Job, screen
 from fdnt_xp.shears.counter_shear import FrameNoise, FrameValues, Statistic, in_new_frame
 from fdnt_xp.shears.cuts import QUANTITIES, FrameQuantities
+from fdnt_xp.shears.masks import SampleMask
 
 Gamma: TypeAlias = tuple[float, float]
 """A trial shear, eta-type."""
@@ -66,6 +68,19 @@ class SampleNoise:
         )
 
 
+@dataclass(frozen=True, kw_only=True)
+class SampleValues(FrameValues):
+    """The statistic of a sample in one frame.
+
+    Parameters
+    ----------
+    flags : array, shape (n_gal,), int32
+        What is to be said of the stamps; those with a bit of `FAILED` are not `found`.
+    """
+
+    flags: Array
+
+
 @dataclass(kw_only=True)
 class FrameSample:
     """Galaxies to be looked at in counter-sheared frames.
@@ -80,6 +95,7 @@ class FrameSample:
     chunk_size : int
         Galaxies in memory together.
     noise : SampleNoise, optional
+    mask : SampleMask, optional
     """
 
     stamps: Array
@@ -88,6 +104,7 @@ class FrameSample:
     reach: float
     chunk_size: int
     noise: SampleNoise | None = None
+    mask: SampleMask | None = None
     _solutions: dict[int, tuple[Gamma, Array]] = field(default_factory=dict)
     """Of each chunk, by its first row: the last frame and the unknowns that were solved there,
     the start of the next."""
@@ -106,6 +123,7 @@ class FrameSample:
             reach=self.reach,
             chunk_size=self.chunk_size,
             noise=None if self.noise is None else self.noise.rows(rows),
+            mask=None if self.mask is None else self.mask.rows(rows),
         )
 
     def told_of_noise(self, factor: float) -> FrameSample:
@@ -115,12 +133,9 @@ class FrameSample:
         noise = replace(self.noise, pixels=self.noise.pixels.scaled(factor))
         return replace(self, noise=noise, _solutions=dict(self._solutions))
 
-    def evaluate(self, gammas: Sequence[Gamma]) -> list[FrameValues]:
-        """Return the statistic of all galaxies in each frame.
-
-        Galaxies that cannot be measured at all are not `found`.
-        """
-        parts: list[list[FrameValues]] = [[] for _ in gammas]
+    def evaluate(self, gammas: Sequence[Gamma]) -> list[SampleValues]:
+        """Return the statistic of all galaxies in each frame."""
+        parts: list[list[SampleValues]] = [[] for _ in gammas]
         # An empty sample still has its one chunk, of no rows.
         for first in range(0, max(self.n_gal, 1), self.chunk_size):
             rows = slice(first, min(first + self.chunk_size, self.n_gal))
@@ -128,13 +143,13 @@ class FrameSample:
                 of_frame.append(values)
         return [_joined(of_frame) for of_frame in parts]
 
-    def _evaluate_chunk(self, rows: slice, gammas: Sequence[Gamma]) -> Iterator[FrameValues]:
+    def _evaluate_chunk(self, rows: slice, gammas: Sequence[Gamma]) -> Iterator[SampleValues]:
         xp = array_namespace(stamps=self.stamps)
         job = self.job.rows(rows)
         grid = job.coarse
         like = {"dtype": self.stamps.dtype, "device": device_of(self.stamps)}
         noise = None if self.noise is None else self.noise.rows(rows)
-        stamps, flags = screen(self.stamps[rows, :, :], job.psf)
+        stamps, flags = self._screened(rows)
         optics = self._shared_optics or _Optics.of(job, noise)
         galaxies = deconvolve(stamps, optics.inverse_transfer, grid)
         synthetic = None if noise is None else noise.draw(grid)
@@ -152,8 +167,28 @@ class FrameSample:
                 frame_noise = FrameNoise(power=power, variance=noise.pixels.variance)
             values = self.statistic.evaluate(sheared, seen, weight, start, frame_noise)
             frame, start = gamma, values.solution
-            yield _only_where(values, flags == 0)
+            yield _withdrawn(values, flags)
         self._solutions[rows.start] = (frame, start)
+
+    def _screened(self, rows: slice) -> tuple[Array, Array]:
+        """Return stamps that do no harm, their gaps filled, and what is to be said of them.
+
+        Returns
+        -------
+        stamps : array, shape (n_gal, ny, nx)
+        flags : array, shape (n_gal,), int32
+            Bits of `Flag`; with one of `FAILED` the galaxy cannot be measured.
+        """
+        psf = self.job.rows(rows).psf
+        stamps = self.stamps[rows, :, :]
+        if self.mask is None:
+            return screen(stamps, psf)
+        xp = array_namespace(stamps=stamps)
+        stamps, dropped, filled = self.mask.rows(rows).applied(stamps, psf)
+        stamps, flags = screen(stamps, psf)
+        for reason, holds in ((Flag.MASKED, dropped), (Flag.FILLED, filled)):
+            flags = flags + xp.astype(holds, xp.int32) * int(reason)
+        return stamps, flags
 
     @cached_property
     def _shared_optics(self) -> _Optics | None:
@@ -191,23 +226,25 @@ class _Optics:
         return cls(inverse_transfer=inverse_transfer, noise=deconvolved)
 
 
-def _only_where(values: FrameValues, usable: Array) -> FrameValues:
+def _withdrawn(values: FrameValues, flags: Array) -> SampleValues:
     """Return the values with those of unusable galaxies withdrawn."""
-    xp = array_namespace(usable=usable)
+    xp = array_namespace(flags=flags)
+    usable = xp.bitwise_and(flags, xp.full_like(flags, int(FAILED))) == 0
 
     def masked(column: Array) -> Array:
         return xp.where(usable, column, xp.full_like(column, math.nan))
 
     quantities = {name: masked(getattr(values.quantities, name)) for name in QUANTITIES}
-    return FrameValues(
+    return SampleValues(
         v=xp.where(usable[:, None], values.v, xp.zeros_like(values.v)),
         found=values.found & usable,
         solution=values.solution,
         quantities=FrameQuantities(**quantities),
+        flags=flags,
     )
 
 
-def _joined(parts: list[FrameValues]) -> FrameValues:
+def _joined(parts: list[SampleValues]) -> SampleValues:
     xp = array_namespace(v=parts[0].v)
 
     def column(name: str) -> Array:
@@ -216,9 +253,10 @@ def _joined(parts: list[FrameValues]) -> FrameValues:
     quantities = {
         name: xp.concat([getattr(part.quantities, name) for part in parts]) for name in QUANTITIES
     }
-    return FrameValues(
+    return SampleValues(
         v=column("v"),
         found=column("found"),
         solution=column("solution"),
         quantities=FrameQuantities(**quantities),
+        flags=column("flags"),
     )

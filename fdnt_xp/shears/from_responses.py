@@ -56,7 +56,7 @@ def shear_from_responses(
 
     Notes
     -----
-    `g = <R>⁻¹ <v>` is exact to second order in the shear: `m` is of order `g²/4`.
+    `g = <R>⁻¹ <v>` is exact to second order in the shear: `m` is of order `g²/10`.
     """
     result = responses if isinstance(responses, ResponseResult) else _from_columns(responses)
     xp = array_namespace(v=result.v)

@@ -16,9 +16,9 @@ from fdnt_xp.arrays import Array, array_namespace, device_of, to_numpy
 from fdnt_xp.errors import RangeError
 from fdnt_xp.flags import FAILED, Flag
 from fdnt_xp.fourier.psf import Psf
-from fdnt_xp.shapes.job import screen
-from fdnt_xp.shears.counter_shear import FrameValues
 from fdnt_xp.shears.cuts import QUANTITIES
+from fdnt_xp.shears.frames import SampleValues
+from fdnt_xp.shears.masks import Masked
 from fdnt_xp.shears.sample import NoiseOptions, make_sample
 
 if TYPE_CHECKING:
@@ -152,6 +152,8 @@ def measure_responses(
     seed: int = 0,
     identifiers: Array | None = None,
     noise_symmetry: Array | None = None,
+    mask: Array | None = None,
+    masked: Masked = "drop",
     size: float | None = None,
     softening: float = 1.0,
     step: float = 0.01,
@@ -164,6 +166,9 @@ def measure_responses(
     ----------
     stamps, psf, noise_variance, noise_power, isotropise, seed, identifiers, noise_symmetry
         As for `population_null`.
+    mask, masked
+        As for `population_null`; what is left out is flagged `MASKED`, what was filled
+        `FILLED`.
     size, softening, padding, chunk_size
         As for `population_null`, statistic "frozen".
     step : float
@@ -200,13 +205,15 @@ def measure_responses(
             identifiers=identifiers,
             symmetry=noise_symmetry,
         ),
+        mask=mask,
+        masked=masked,
     )
     xp = array_namespace(stamps=stamps)
     eta = 2.0 * math.atanh(step)
     # To put shear on is to take the opposite shear off.
     frames = ((0.0, 0.0), (-eta, 0.0), (eta, 0.0), (0.0, -eta), (0.0, eta))
     seen = sample.evaluate(frames)
-    flags = _flags(sample.stamps, psf, seen)
+    flags = _flags(seen)
     measured = xp.bitwise_and(flags, xp.full_like(flags, int(FAILED))) == 0
     slopes = [(seen[1 + 2 * j].v - seen[2 + 2 * j].v) / (2.0 * step) for j in (0, 1)]
 
@@ -232,10 +239,11 @@ def measure_responses(
     )
 
 
-def _flags(stamps: Array, psf: Psf, seen: list[FrameValues]) -> Array:
+def _flags(seen: list[SampleValues]) -> Array:
     """Return why galaxies have no response, and which were lost in some frame."""
-    xp = array_namespace(stamps=stamps)
-    _, flags = screen(stamps, psf)
+    flags = seen[0].flags
+    xp = array_namespace(flags=flags)
     n_found = sum((xp.astype(one.found, xp.int32) for one in seen), xp.zeros_like(flags))
-    lost = (flags == 0) & (n_found < len(seen))
+    usable = xp.bitwise_and(flags, xp.full_like(flags, int(FAILED))) == 0
+    lost = usable & (n_found < len(seen))
     return flags + xp.astype(lost, xp.int32) * int(Flag.LOST_IN_FRAME)

@@ -19,6 +19,7 @@ from fdnt_xp.fourier.psf import Psf
 from fdnt_xp.shapes.job import check_count, check_options, check_stamps, galaxies_at_once, prepare
 from fdnt_xp.shears.counter_shear import FrozenQuadrupole, SolvedEta, Statistic
 from fdnt_xp.shears.frames import FrameSample, SampleNoise
+from fdnt_xp.shears.masks import Masked, SampleMask
 from fdnt_xp.shears.weights import ShapeWeight
 
 StatisticName: TypeAlias = Literal["frozen", "eta"]
@@ -59,6 +60,8 @@ def make_sample(
     padding: int,
     chunk_size: int | None,
     noise: NoiseOptions,
+    mask: Array | None = None,
+    masked: Masked = "drop",
 ) -> FrameSample:
     """Check everything, and choose weight, statistic and chunks.
 
@@ -80,7 +83,7 @@ def make_sample(
     sample_noise = _sample_noise(xp, stamps, noise)
     noisy = sample_noise is not None
     job = prepare(xp, stamps, psf.ending_at(_NOISY_FLOOR) if noisy else psf, padding, size, 0)
-    frozen_size = size or _FROZEN_SIZE * 3.0 / psf.largest_kmax
+    frozen_size = default_size(psf) if size is None else size
     chosen: Statistic
     if statistic == "frozen":
         chosen = FrozenQuadrupole(
@@ -105,7 +108,18 @@ def make_sample(
         reach=math.sqrt((1.0 + max_shear) / (1.0 - max_shear)),
         chunk_size=chunk_size or galaxies_at_once(job.coarse, stamps),
         noise=sample_noise,
+        # On the image the weight is convolved with something as wide as the PSF.
+        mask=SampleMask.of(xp, stamps, mask, masked, math.hypot(frozen_size, job.length)),
     )
+
+
+def default_size(psf: Psf) -> float:
+    """Return the default size of the frozen weight for galaxies with these PSFs, pixels.
+
+    Parts of a sample that are measured apart, with PSFs of their own, are one sample only
+    if they are given one `size`.
+    """
+    return _FROZEN_SIZE * 3.0 / psf.largest_kmax
 
 
 def _sample_noise(xp: ModuleType, stamps: Array, options: NoiseOptions) -> SampleNoise | None:

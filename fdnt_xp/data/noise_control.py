@@ -1,0 +1,212 @@
+"""A control variate for tests of noise bias: what noise does to the null at second order.
+
+In a simulation both the galaxy and its noise are known. Expand the frozen quadrupole
+`u = q/D(q0)`, `D = sqrt(q0² + c² n²)`, to second order in the noise about the galaxy without
+noise, at its true centroid, in the frame of the true shear. With δ the part of a moment that is
+linear in the noise, d the dipole, A the second moments, `δx = -A⁻¹ δd` the step of the
+centroid, and `c_i = sum W M f_i kappa`, `Q_i = -sum W R f_i kappa kappa`, where `f_i` is the
+monomial of `q_i` (docs, "Tests of bias with less noise")::
+
+    T_i = - δq_i δq0 D'/D² + q_i δq0² (D'²/D³ - D''/2D²)
+          + (δx.Q_i.δx/2 - δc_i.δx)/D - q_i D'/D² (δx.Q_0.δx/2 - δc_0.δx)
+
+Its expectation is a sum over modes of the noise power, known exactly. So `T - <T>` has the
+mean 0 whatever the estimator does, and nearly all of the scatter that is left when noise of
+both signs is used: taking it off makes m 5 to 20 times as certain at S/N 15 to 20.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdnt_xp.fourier.grid import KGrid
+from fdnt_xp.fourier.noise import DeconvolvedNoise, PixelNoise, RoundNoise
+from fdnt_xp.fourier.psf import Psf
+from fdnt_xp.fourier.transform import DeconvolvedStamps, deconvolve
+from fdnt_xp.shears.counter_shear import FrozenQuadrupole
+from fdnt_xp.shears.frames import FrameSample, Gamma
+from fdnt_xp.shears.sample import NoiseOptions, make_sample
+
+Real = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownNoise:
+    """Galaxies and their noise apart, on the host.
+
+    Parameters
+    ----------
+    clean, noise : array, shape (n_gal, ny, nx)
+    psf : Psf
+        One for all, or one for each.
+    variance : float
+        Of a pixel.
+    identifiers, symmetry : array of int64, shape (n_gal,)
+    seed : int
+        Of the synthetic noise, as `population_null` is told.
+    softening : float
+    """
+
+    clean: Real
+    noise: Real
+    psf: Psf
+    variance: float
+    identifiers: NDArray[np.int64]
+    symmetry: NDArray[np.int64]
+    seed: int
+    softening: float
+
+
+def second_order(known: KnownNoise, gamma: Gamma) -> Real:
+    """Return `T - <T>` of the statistic v of `population_null`, shape (n_gal, 2).
+
+    Parameters
+    ----------
+    known : KnownNoise
+    gamma : tuple of float
+        The true shear, eta-type.
+    """
+    sample = make_sample(
+        known.clean,
+        known.psf,
+        statistic="frozen",
+        weight=None,
+        size=None,
+        softening=known.softening,
+        max_shear=0.1,
+        padding=1,
+        chunk_size=None,
+        noise=NoiseOptions(
+            noise_variance=known.variance,
+            noise_power=None,
+            isotropise=None,
+            seed=known.seed,
+            identifiers=known.identifiers,
+            symmetry=known.symmetry,
+        ),
+    )
+    frame = sample.job.coarse.sheared(np.asarray(gamma))
+    signal, noise, weight, power = _in_frame(sample, known, frame, gamma)
+    statistic = sample.statistic
+    assert isinstance(statistic, FrozenQuadrupole)
+    start = np.zeros((len(known.clean), 2))
+    shrunk = sample.job.weight.shrunk(sample.reach)
+    solution = statistic.evaluate(frame, signal, shrunk, start, None).solution
+    moments = _Moments.of(frame, weight, signal, noise, power, statistic.length * solution)
+    return moments.second_order(statistic.softening)
+
+
+def _in_frame(
+    sample: FrameSample, known: KnownNoise, frame: KGrid, gamma: Gamma
+) -> tuple[DeconvolvedStamps, DeconvolvedStamps, Real, Real]:
+    """Return galaxies, their noise made round, the weight, and the power of that noise."""
+    grid, psf = sample.job.coarse, sample.job.psf
+    inverse = psf.inverse_transfer(grid)
+    variance = np.full(len(known.clean), known.variance)
+    deconvolved = DeconvolvedNoise.behind(psf, PixelNoise(variance=variance), grid, inverse)
+    wanted = deconvolved.made_round(frame, gamma, sample.reach)
+    synthetic = RoundNoise.draw(known.identifiers, known.seed, variance, grid, known.symmetry)
+    noise = synthetic.added_to(deconvolve(known.noise, inverse, grid), wanted - deconvolved.power)
+    statistic = sample.statistic
+    assert isinstance(statistic, FrozenQuadrupole)
+    weight = sample.job.weight.shrunk(sample.reach).round_window(frame, statistic.size)
+    return deconvolve(known.clean, inverse, grid), noise, weight, known.variance * wanted
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Moments:
+    """Moments at the centroid of the galaxy without noise; (q1, q2, q0) in this order.
+
+    q, A, Q are those of the galaxy, dq, d, c of its noise, and the others covariances of those.
+    """
+
+    q: Real  # (n_gal, 3)
+    A: Real  # (n_gal, 2, 2)
+    Q: Real  # (n_gal, 3, 2, 2)
+    dq: Real  # (n_gal, 3)
+    d: Real  # (n_gal, 2)
+    c: Real  # (n_gal, 3, 2)
+    var_q0: Real  # (n_psf,)
+    cov_q_q0: Real  # (n_psf, 2)
+    cov_d: Real  # (n_psf, 2, 2)
+    cov_c_d: Real  # (n_psf, 3, 2, 2)
+
+    @classmethod
+    def of(
+        cls,
+        grid: KGrid,
+        weight: Real,
+        signal: DeconvolvedStamps,
+        noise: DeconvolvedStamps,
+        power: Real,
+        centroid: Real,
+    ) -> _Moments:
+        re, _ = signal.shifted(grid, centroid)
+        _, s2, s4 = grid.even_moments(weight * re)
+        noise_re, noise_im = noise.shifted(grid, centroid)
+        _, n2, _ = grid.even_moments(weight * noise_re)
+        n1, n3 = grid.odd_moments(weight * noise_im)
+        # The covariance of two moments is the moment of the product of their monomials.
+        _, p2, p4 = grid.even_moments(weight**2 * power)
+        return cls(
+            q=_quadrupoles(s2),
+            A=_matrix(s2),
+            Q=-_quadrupoles_by_pairs(s4),
+            dq=_quadrupoles(n2),
+            d=n1,
+            c=_quadrupoles_by_k(n3),
+            var_q0=p4[:, 0] + 2.0 * p4[:, 2] + p4[:, 4],
+            cov_q_q0=np.stack([p4[:, 0] - p4[:, 4], 2.0 * (p4[:, 1] + p4[:, 3])], axis=-1),
+            cov_d=_matrix(p2),
+            cov_c_d=_quadrupoles_by_pairs(p4),
+        )
+
+    def second_order(self, softening: float) -> Real:
+        """Return `T - <T>` of v = -u, shape (n_gal, 2)."""
+        inverse = np.linalg.inv(self.A)
+        step = -np.einsum("nij,nj->ni", inverse, self.d)
+        by_centroid = 0.5 * np.einsum("ni,nfij,nj->nf", step, self.Q, step)
+        by_centroid -= np.einsum("nfi,ni->nf", self.c, step)
+        step_cov = np.einsum("nij,njk,nlk->nil", inverse, self.cov_d + 0 * inverse, inverse)
+        expected = 0.5 * np.einsum("nij,nfij->nf", step_cov, self.Q)
+        expected += np.einsum("nfij,nij->nf", self.cov_c_d + 0 * self.Q, inverse)
+        products = self.dq[:, :2] * self.dq[:, 2:] - self.cov_q_q0
+        square = self.dq[:, 2] ** 2 - self.var_q0
+        return -self._terms(softening, products, square, by_centroid - expected)
+
+    def _terms(self, softening: float, products: Real, square: Real, by_centroid: Real) -> Real:
+        """Return T of δq_i δq0, δq0² and what the centroid does to (q1, q2, q0)."""
+        q, q0 = self.q[:, :2], self.q[:, 2:]
+        soft = softening**2 * self.var_q0[:, None]
+        D = np.sqrt(q0**2 + soft)
+        first, second = q0 / D, soft / D**3
+        return np.asarray(
+            -products * first / D**2
+            + q * square[:, None] * (first**2 / D**3 - 0.5 * second / D**2)
+            + by_centroid[:, :2] / D
+            - q * by_centroid[:, 2:] * first / D**2
+        )
+
+
+def _matrix(m2: Real) -> Real:
+    """Return second moments as matrices, (n, 2, 2)."""
+    return np.stack([m2[:, 0:2], m2[:, 1:3]], axis=1)
+
+
+def _quadrupoles(m2: Real) -> Real:
+    """Return the moments of `kx² - ky²`, `2 kx ky` and `|k|²` from those of degree 2."""
+    return np.stack([m2[:, 0] - m2[:, 2], 2.0 * m2[:, 1], m2[:, 0] + m2[:, 2]], axis=-1)
+
+
+def _quadrupoles_by_k(m3: Real) -> Real:
+    """Return the same times kx and ky, (n, 3, 2), from moments of degree 3."""
+    return np.stack([_quadrupoles(m3[:, i : i + 3]) for i in (0, 1)], axis=-1)
+
+
+def _quadrupoles_by_pairs(m4: Real) -> Real:
+    """Return the same times kx², kx ky and ky², (n, 3, 2, 2), from moments of degree 4."""
+    xx, xy, yy = (_quadrupoles(m4[:, i : i + 3]) for i in (0, 1, 2))
+    return np.stack([np.stack([xx, xy], axis=-1), np.stack([xy, yy], axis=-1)], axis=-2)
