@@ -3,6 +3,7 @@
 One code for NumPy, torch, JAX and CuPy: the arrays that are given decide where it runs.
 """
 
+from fdnt_xp.data.noise_power import measure_noise_power as measure_noise_power
 from fdnt_xp.data.ring import RingResult as RingResult
 from fdnt_xp.data.ring import ring_test as ring_test
 from fdnt_xp.fourier.psf import Psf as Psf
@@ -27,6 +28,7 @@ __all__ = [
     "ShapeResult",
     "ShearEstimate",
     "__version__",
+    "measure_noise_power",
     "measure_responses",
     "measure_shapes",
     "population_null",

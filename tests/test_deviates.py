@@ -53,9 +53,7 @@ def test_every_library_draws_the_same(xp, dtype, to_xp):
     single = "32" in str(dtype)
     for one, wanted in zip(ours, host, strict=True):
         # float32 keeps 24 of the 32 bits of a word.
-        assert_close(
-            one, to_xp(wanted, dtype), rtol=0, atol=3e-6 if single else 1e-15, xp=xp
-        )
+        assert_close(one, to_xp(wanted, dtype), rtol=0, atol=3e-6 if single else 1e-15, xp=xp)
 
 
 def test_order_and_batch_change_nothing(xp, dtype, to_xp, to_np):

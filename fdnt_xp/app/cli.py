@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import warnings
 from collections.abc import Callable
@@ -18,6 +19,7 @@ from fdnt_xp.app.gradient_figure import GradientFigure, draw_gradient_figure
 from fdnt_xp.app.measure import Inputs, Settings, measure_files
 from fdnt_xp.app.plots import check_figure, plot_catalog, save_figure
 from fdnt_xp.app.ring import RingOptions, run_ring
+from fdnt_xp.app.shear import catalog_shear, report_lines
 from fdnt_xp.app.summary import summary_lines
 from fdnt_xp.data.catalog import check_catalog, read_catalog, write_catalog
 from fdnt_xp.errors import FdntError, FdntWarning
@@ -153,6 +155,23 @@ def main() -> None:
     metavar="CATALOG",
     help="Catalog to write: .fits, .ecsv or .parquet.",
 )
+@click.option(
+    "--responses",
+    is_flag=True,
+    help="Measure responses to shear, for the command shear, not shapes.",
+)
+@click.option(
+    "--seed",
+    type=int,
+    default=0,
+    show_default=True,
+    help="Of the noise that --responses adds to make all noise round.",
+)
+@click.option(
+    "--noise-image",
+    metavar="FITS",
+    help="Blank sky to measure the noise on: an image, or a cube of stamps.",
+)
 @_HOW
 @_OVERWRITE
 def measure(
@@ -165,6 +184,7 @@ def measure(
     y_column: str,
     origin: str,
     output: str,
+    noise_image: str | None,
     overwrite: bool,
     **how: Any,
 ) -> None:
@@ -183,6 +203,7 @@ def measure(
         x_column=x_column,
         y_column=y_column,
         origin=int(origin),
+        noise_image=noise_image,
     )
     settings = Settings(**how)
     inputs.refuse_as_output(output)
@@ -202,12 +223,37 @@ def measure(
 )
 @_OVERWRITE
 def plot(catalog: str, output: str | None, overwrite: bool) -> None:
-    """Draw a page about CATALOG: shapes on the image, histograms, S/N, flags."""
+    """Draw a page about CATALOG: map of the image, histograms, S/N, flags."""
     target = Path(output) if output else Path(catalog).with_suffix(".png")
     check_figure(target, overwrite=overwrite)
     figure = plot_catalog(read_catalog(catalog), Path(catalog).name)
     save_figure(figure, target, overwrite=overwrite)
     click.echo(f"written    {target}")
+
+
+@main.command(name="shear", cls=_Command)
+@click.argument("catalog")
+@click.option(
+    "--cut",
+    "cuts",
+    multiple=True,
+    metavar="CUT",
+    help='"snr>15", "size<3", "flux>100"; may be repeated, and all must be passed.',
+)
+@click.option("--json", "as_json", is_flag=True, help="Print numbers in full, as JSON.")
+def mean_shear(catalog: str, cuts: tuple[str, ...], as_json: bool) -> None:
+    """Print the shear of the galaxies of CATALOG, from measure --responses.
+
+    What a cut itself does to the shear is taken into account.
+    """
+    table = read_catalog(catalog)
+    estimate = catalog_shear(table, cuts).to_numpy()
+    if as_json:
+        facts = {"catalog": catalog, "n_gal": len(table), "cuts": cuts}
+        click.echo(json.dumps(facts | estimate.to_dict(), indent=2))
+        return
+    for line in report_lines(estimate, len(table)):
+        click.echo(line)
 
 
 @main.command(cls=_Command)

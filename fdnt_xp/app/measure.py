@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fdnt_xp.app.backends import load_backend
-from fdnt_xp.app.runner import find_noise, measure_source
+from fdnt_xp.app.backends import Backend, load_backend
+from fdnt_xp.app.responses import measure_source_responses
+from fdnt_xp.app.runner import Noise, find_noise, measure_source
 from fdnt_xp.data.images import Pixels, read_image
-from fdnt_xp.data.provenance import provenance
+from fdnt_xp.data.provenance import Value, provenance
 from fdnt_xp.data.stamps import StampSource, cube_stamps, grid_stamps, position_stamps
 from fdnt_xp.data.tables import read_positions
 from fdnt_xp.errors import CatalogError, FdntValueError
@@ -37,6 +38,8 @@ class Inputs:
         Columns of that table.
     origin : int
         Its first pixel's coordinate.
+    noise_image : str or None
+        FITS file, blank sky: an image, or a cube of stamps.
     """
 
     image: str
@@ -47,6 +50,7 @@ class Inputs:
     x_column: str = "x"
     y_column: str = "y"
     origin: int = 0
+    noise_image: str | None = None
 
     @property
     def layout(self) -> str:
@@ -57,7 +61,7 @@ class Inputs:
 
     def refuse_as_output(self, output: str) -> None:
         """Raise `CatalogError` if the output would replace one of the inputs."""
-        for path in (self.image, self.psf, self.positions):
+        for path in (self.image, self.psf, self.positions, self.noise_image):
             if path is not None and Path(path).resolve() == Path(output).resolve():
                 raise CatalogError(f"{output} is an input; choose another name for the output")
 
@@ -73,13 +77,17 @@ class Settings:
     oversampling : int
         PSF pixels per image pixel.
     noise_variance : float or None
-        Per pixel; measured on the borders of the stamps if None.
+        Per pixel; measured on the noise image or the borders of the stamps if None.
     size : float or None
         Weight size, if fixed.
     chunk : int or None
         Galaxies at a time.
     quiet : bool
         No progress bar.
+    responses : bool
+        Whether to measure responses to shear, not shapes.
+    seed : int
+        Of their synthetic noise.
     """
 
     backend: str = "numpy"
@@ -90,6 +98,8 @@ class Settings:
     size: float | None = None
     chunk: int | None = None
     quiet: bool = False
+    responses: bool = False
+    seed: int = 0
 
 
 def open_source(inputs: Inputs) -> StampSource:
@@ -129,21 +139,46 @@ def measure_files(inputs: Inputs, settings: Settings) -> tuple[Table, float]:
     backend = load_backend(settings.backend, settings.device, settings.dtype)
     source = open_source(inputs)
     psf_pixels: Pixels = read_image(inputs.psf, ndim=(2, 3), what="PSF image")
-    noise = find_noise(source, settings.noise_variance)
+    blank = None
+    if inputs.noise_image is not None:
+        blank = read_image(inputs.noise_image, ndim=(2, 3), what="noise image")
+    noise = find_noise(source, settings.noise_variance, blank)
     start = time.perf_counter()
-    table = measure_source(
-        source,
-        psf_pixels,
-        backend=backend,
-        noise_variance=noise.variance,
-        oversampling=settings.oversampling,
-        size=settings.size,
-        chunk=settings.chunk,
-        quiet=settings.quiet,
-    )
+    if settings.responses:
+        table = measure_source_responses(
+            source,
+            psf_pixels,
+            backend=backend,
+            noise=noise,
+            oversampling=settings.oversampling,
+            size=settings.size,
+            seed=settings.seed,
+            chunk=settings.chunk,
+            quiet=settings.quiet,
+        )
+    else:
+        table = measure_source(
+            source,
+            psf_pixels,
+            backend=backend,
+            noise_variance=noise.variance,
+            oversampling=settings.oversampling,
+            size=settings.size,
+            chunk=settings.chunk,
+            quiet=settings.quiet,
+        )
     seconds = time.perf_counter() - start
+    table.meta = _facts(inputs, settings, backend, noise, table.meta.get("RSTEP"))
+    return table, seconds
+
+
+def _facts(
+    inputs: Inputs, settings: Settings, backend: Backend, noise: Noise, step: float | None
+) -> dict[str, Value]:
+    """Return the header of the catalog."""
     positions = inputs.layout == "positions"
-    table.meta = provenance(
+    return provenance(
+        method="responses" if settings.responses else "shapes",
         backend=backend.library,
         libver=backend.version,
         device=backend.device,
@@ -159,9 +194,13 @@ def measure_files(inputs: Inputs, settings: Settings) -> tuple[Table, float]:
         origin=inputs.origin if positions else None,
         oversamp=settings.oversampling,
         noisevar=noise.variance,
-        noisesrc="given" if noise.border is None else "stamp borders",
+        noiseerr=noise.relative_err,
+        noisesrc=noise.origin,
+        noiseimg=inputs.noise_image,
+        noisecor=noise.power is not None if settings.responses else None,
         bordlvl=noise.border.level if noise.border else None,
         wtsize=settings.size,
         chunk=settings.chunk,
+        seed=settings.seed if settings.responses else None,
+        rstep=step,
     )
-    return table, seconds

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -14,7 +15,9 @@ from numpy.typing import NDArray
 from fdnt_xp.app.summary import (
     count_flags,
     format_measured,
+    is_of_responses,
     mean_and_error,
+    mean_line,
     measured_rows,
 )
 from fdnt_xp.data.files import check_writable, new_file
@@ -37,7 +40,6 @@ _NO_MATPLOTLIB: Final = (
     "figures need matplotlib, which is not installed: pip install 'fdnt-xp[plot]'"
 )
 FORMATS: Final = (".png", ".pdf", ".svg")
-NEEDED: Final = ("x", "y", "x_image", "y_image", "e1", "e2", "snr", "flags")
 _MOST_WHISKERS: Final = 400
 """Up to this many galaxies each has its own whisker; more are averaged."""
 _GALAXIES_PER_BIN: Final = 16
@@ -57,13 +59,34 @@ _STYLE: Final = {
 }
 
 
+@dataclass(frozen=True)
+class _Kind:
+    """What a catalog holds, and the words for it."""
+
+    columns: tuple[str, str]
+    symbol: str
+    title: str
+    component: str
+
+
+_SHAPES: Final = _Kind(("e1", "e2"), "e", "Shapes", "component of the distortion")
+_RESPONSES: Final = _Kind(
+    ("v1", "v2"), "v", "Quadrupoles", "component of the normalised quadrupole"
+)
+_ALL_HAVE: Final = ("snr", "flags")
+NEEDED: Final = ("x", "y", "x_image", "y_image", *_SHAPES.columns, *_ALL_HAVE)
+
+
 def plot_catalog(table: Table, title: str | None = None) -> Figure:
     """Draw the page: map of shapes, their histograms, flags, centroids, S/N.
+
+    For a catalog of responses it is the quadrupoles that are drawn, and their responses in
+    place of the ellipticity.
 
     Parameters
     ----------
     table : astropy.table.Table
-        A catalog of `fdnt-xp measure`.
+        A catalog of `fdnt-xp measure`, with `--responses` or without.
     title : str, optional
         What to call it.
 
@@ -79,19 +102,24 @@ def plot_catalog(table: Table, title: str | None = None) -> Figure:
     MissingExtraError
         If matplotlib is not installed.
     """
-    if missing := [name for name in NEEDED if name not in table.colnames]:
+    needed = NEEDED[:4] if is_of_responses(table) else NEEDED
+    if missing := [name for name in needed if name not in table.colnames]:
         raise CatalogError(
             f"this is no catalog of fdnt-xp measure: it has no column {', '.join(missing)}"
         )
+    kind = _RESPONSES if is_of_responses(table) else _SHAPES
     good = table[measured_rows(table)]
     with page_style():
         figure = new_figure(13.5, 11.5)
         panels = [["map", "map", "e"], ["map", "map", "abs"], ["flags", "centroid", "snr"]]
         axes: dict[str, Axes] = figure.subplot_mosaic(panels)
         figure.suptitle(_headline(table, good, title), x=0.015, ha="left", fontsize=13)
-        _draw_map(axes["map"], good)
-        _draw_components(axes["e"], good)
-        _draw_modulus(axes["abs"], good)
+        _draw_map(axes["map"], good, kind)
+        _draw_components(axes["e"], good, kind)
+        if kind is _SHAPES:
+            _draw_modulus(axes["abs"], good)
+        else:
+            _draw_responses(axes["abs"], good)
         _draw_flags(axes["flags"], table)
         _draw_centroids(axes["centroid"], good)
         _draw_snr(axes["snr"], good)
@@ -135,30 +163,27 @@ def check_figure(path: str | os.PathLike[str], *, overwrite: bool = False) -> No
 
 
 def _headline(table: Table, good: Table, title: str | None) -> str:
-    means = [mean_and_error(np.asarray(good[name])) for name in ("e1", "e2")]
     text = f"{len(good):,} of {len(table):,} galaxies measured"
     if len(good):
-        text += "    mean shape  " + ",  ".join(
-            f"e{i} = {format_measured(*mean)}" for i, mean in enumerate(means, start=1)
-        )
+        text += f"    {mean_line(table)}"
     return f"{title}\n{text}" if title else text
 
 
-def _draw_map(axes: Axes, good: Table) -> None:
+def _draw_map(axes: Axes, good: Table, kind: _Kind) -> None:
     """Whiskers along the major axes, averaged in bins where there are many."""
     x, y = np.asarray(good["x"], float), np.asarray(good["y"], float)
     if len(good) and np.ptp(x) == 0 and np.ptp(y) == 0:
-        _draw_plane(axes, good)
+        _draw_plane(axes, good, kind)
         return
-    e = np.asarray(good["e1"]) + 1j * np.asarray(good["e2"])
+    e = _complex(good, kind)
     axes.set(xlabel="x [pixel]", ylabel="y [pixel]", aspect="equal")
-    axes.set_title("Shapes on the image")
+    axes.set_title(f"{kind.title} on the image")
     if not len(good):
         _say(axes, "no galaxy was measured")
         return
     if len(good) > _MOST_WHISKERS:
         x, y, e, bins = _average(x, y, e)
-        axes.set_title(f"Shapes on the image, mean of bins of {bins:.0f} pixels")
+        axes.set_title(f"{kind.title} on the image, mean of bins of {bins:.0f} pixels")
     modulus = np.abs(e)
     direction = np.sqrt(e / np.where(modulus > 0, modulus, 1.0))
     longest = float(np.quantile(modulus, 0.98)) or 1.0
@@ -184,17 +209,33 @@ def _draw_map(axes: Axes, good: Table) -> None:
     room = 0.8 * spacing
     axes.set(xlim=(x.min() - room, x.max() + room), ylim=(y.min() - room, y.max() + room))
     bar = axes.figure.colorbar(whiskers, ax=axes, shrink=0.75, pad=0.02, extend="max")
-    bar.set_label("|e|, also the length of a whisker")
+    bar.set_label(f"|{kind.symbol}|, also the length of a whisker")
     bar.outline.set_visible(False)
 
 
-def _draw_plane(axes: Axes, good: Table) -> None:
-    """For stamps without a place on an image: e2 against e1."""
-    axes.plot(good["e1"], good["e2"], ".", ms=3, alpha=_alpha(len(good)), color=BLUE, mew=0)
-    angle = np.linspace(0, 2 * np.pi, 181)
-    axes.plot(np.cos(angle), np.sin(angle), color=PALE, lw=1)
-    axes.set(xlim=(-1.05, 1.05), ylim=(-1.05, 1.05), aspect="equal", xlabel="e1", ylabel="e2")
-    axes.set_title("Shapes (stamps of a cube have no place on an image)")
+def _draw_plane(axes: Axes, good: Table, kind: _Kind) -> None:
+    """For stamps without a place on an image: one component against the other."""
+    first, second = kind.columns
+    axes.plot(good[first], good[second], ".", ms=3, alpha=_alpha(len(good)), color=BLUE, mew=0)
+    reach = _reach(good, kind)
+    if kind is _SHAPES:
+        angle = np.linspace(0, 2 * np.pi, 181)
+        axes.plot(np.cos(angle), np.sin(angle), color=PALE, lw=1)
+    limits = (-1.05 * reach, 1.05 * reach)
+    axes.set(xlim=limits, ylim=limits, aspect="equal", xlabel=first, ylabel=second)
+    axes.set_title(f"{kind.title} (stamps of a cube have no place on an image)")
+
+
+def _complex(good: Table, kind: _Kind) -> NDArray[np.complex128]:
+    first, second = kind.columns
+    return np.asarray(good[first]) + 1j * np.asarray(good[second])
+
+
+def _reach(good: Table, kind: _Kind) -> float:
+    """Return the end of the axes of components: 1 for a distortion, else beyond most."""
+    if kind is _SHAPES or not len(good):
+        return 1.0
+    return 1.3 * float(np.quantile(np.abs(_complex(good, kind)), 0.99)) or 1.0
 
 
 def _average(
@@ -212,19 +253,39 @@ def _average(
     return means[0], means[1], means[2] + 1j * means[3], float(side)
 
 
-def _draw_components(axes: Axes, good: Table) -> None:
-    edges = np.linspace(-1, 1, 1 + 2 * _bins(len(good))).tolist()
-    for name, color in (("e1", BLUE), ("e2", ORANGE)):
-        values = np.asarray(good[name])
-        mean, error = mean_and_error(values)
-        label = f"{name}: {format_measured(mean, error)}" if len(good) else name
-        axes.hist(values, edges, histtype="step", lw=1.6, color=color, label=label)
+def _draw_components(axes: Axes, good: Table, kind: _Kind) -> None:
+    reach = _reach(good, kind)
+    edges = np.linspace(-reach, reach, 1 + 2 * _bins(len(good))).tolist()
+    for name, color in zip(kind.columns, (BLUE, ORANGE), strict=True):
+        _step_histogram(axes, good, name, edges, color)
     axes.axvline(0, color=PALE, lw=1, zorder=0)
-    axes.set(xlim=(-1, 1), xlabel="component of the distortion", ylabel="galaxies")
-    axes.set_xticks([-1, -0.5, 0, 0.5, 1])
+    axes.set(xlim=(-reach, reach), xlabel=kind.component, ylabel="galaxies")
+    if kind is _SHAPES:
+        axes.set_xticks([-1, -0.5, 0, 0.5, 1])
     axes.set_title("Components")
     _headroom(axes, 1.4)
     axes.legend(loc="upper left", fontsize=9)
+
+
+def _draw_responses(axes: Axes, good: Table) -> None:
+    """Show the two that do not vanish on average; a few per cent lie beyond the axis."""
+    names = ("R11", "R22")
+    values = np.concatenate([np.asarray(good[name], float) for name in names])
+    low, high = np.quantile(values, (0.01, 0.99)) if len(values) else (-1.0, 1.0)
+    edges = np.linspace(low, high if high > low else low + 1.0, 1 + 2 * _bins(len(good))).tolist()
+    for name, color in zip(names, (BLUE, ORANGE), strict=True):
+        _step_histogram(axes, good, name, edges, color)
+    axes.set(xlim=(edges[0], edges[-1]), xlabel="response to shear", ylabel="galaxies")
+    axes.set_title("Responses")
+    _headroom(axes, 1.4)
+    axes.legend(loc="upper left", fontsize=9)
+
+
+def _step_histogram(axes: Axes, good: Table, name: str, edges: list[float], color: str) -> None:
+    values = np.asarray(good[name])
+    mean, error = mean_and_error(values)
+    label = f"{name}: {format_measured(mean, error)}" if len(good) else name
+    axes.hist(values, edges, histtype="step", lw=1.6, color=color, label=label)
 
 
 def _draw_modulus(axes: Axes, good: Table) -> None:

@@ -1,4 +1,4 @@
-"""What a run says at its end: how many were measured, why not the others, the mean shape."""
+"""What a run says at its end: how many were measured, why not the others, the mean."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fdnt_xp.errors import FdntValueError
 from fdnt_xp.flags import FAILED, Flag, flag_text
+from fdnt_xp.shears.from_responses import shear_from_responses
+from fdnt_xp.shears.responses import COLUMNS
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -20,6 +23,11 @@ def measured_rows(table: Table) -> NDArray[np.bool_]:
     flags: NDArray[np.int64] = np.asarray(table["flags"], dtype=np.int64)
     good: NDArray[np.bool_] = (flags & int(FAILED)) == 0
     return good
+
+
+def is_of_responses(table: Table) -> bool:
+    """Return whether it is a catalog of responses to shear, and not one of shapes."""
+    return set(COLUMNS) <= set(table.colnames) and "RSTEP" in table.meta
 
 
 def count_flags(table: Table) -> dict[str, int]:
@@ -51,11 +59,25 @@ def summary_lines(table: Table, seconds: float | None = None) -> Iterator[str]:
                 yield f"{title:<10} {count:>6}  {name}: {flag_text(name)}"
                 title = ""
     if n_good:
-        parts = []
-        for component in ("e1", "e2"):
-            mean, error = mean_and_error(np.asarray(table[component])[good])
-            parts.append(f"{component} = {format_measured(mean, error)}")
-        yield f"mean shape {', '.join(parts)}"
+        yield mean_line(table)
+
+
+def mean_line(table: Table) -> str:
+    """Return the mean of a catalog and its error: the shape, or with responses the shear."""
+    if not is_of_responses(table):
+        good = table[measured_rows(table)]
+        e = [mean_and_error(np.asarray(good[name])) for name in ("e1", "e2")]
+        return f"mean shape {_components('e', e)}"
+    try:
+        shear = shear_from_responses(table)
+    except FdntValueError as error:
+        return f"mean shear cannot be told: {error}"
+    g = [(float(shear.g[i]), float(shear.g_err[i])) for i in (0, 1)]
+    return f"mean shear {_components('g', g)}"
+
+
+def _components(symbol: str, measured: list[tuple[float, float]]) -> str:
+    return ", ".join(f"{symbol}{i + 1} = {format_measured(*one)}" for i, one in enumerate(measured))
 
 
 def format_measured(value: float, error: float) -> str:

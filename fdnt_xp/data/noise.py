@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fdnt_xp.data.noise_power import group_error
 from fdnt_xp.data.stamps import StampSource
 
 _SIGMA_PER_MAD: Final = 1.482602218505602
 """Standard deviation of a Gaussian over its median absolute deviation."""
 _MOST_STAMPS: Final = 2000
 """Enough for the variance to a few parts in a thousand, and quick to read."""
-_READ_AT_ONCE: Final = 200
+_GROUPS: Final = 50
+"""Of neighbouring stamps, read at a time; their scatter tells the error."""
+_MAD_EFFICIENCY: Final = 0.3675
+"""Of the median absolute deviation of a Gaussian: its variance over the least possible."""
 _ROUNDING: Final = 1.0 / 12.0
 """Variance of a number uniform over one unit."""
 
@@ -28,6 +32,12 @@ class BorderNoise:
     ----------
     variance : float
         Of one pixel, in (unit of the image)²; NaN if no border pixel is finite.
+    variance_err : float
+        Its standard error: the larger of that of independent Gaussian pixels,
+        `variance sqrt(2/(0.3675 n_pixels))`, and of the scatter between 50 groups of
+        neighbouring stamps, in which correlated pixels, bright neighbours and changes over
+        the image are seen. Neighbours that all groups have alike are not: they raise the
+        variance itself. What the error does to a shear, `fdnt_xp.data.noise_power` says.
     level : float
         Median of the border pixels: the background that was left in the image.
     level_err : float
@@ -37,6 +47,7 @@ class BorderNoise:
     """
 
     variance: float
+    variance_err: float
     level: float
     level_err: float
     n_pixels: int
@@ -62,23 +73,36 @@ def measure_border_noise(source: StampSource) -> BorderNoise:
     The border is a sixteenth of the stamp wide. All stamps are pooled, or 2000 of them
     evenly spread, so that a few bright neighbours, however bright, change nothing.
     """
-    pixels = _border_pixels(source)
-    if pixels.size == 0:
-        return BorderNoise(variance=math.nan, level=math.nan, level_err=math.nan, n_pixels=0)
+    groups = [group for group in _border_pixels(source) if group.size]
+    n_pixels = sum(group.size for group in groups)
+    if n_pixels == 0:
+        nan = math.nan
+        return BorderNoise(variance=nan, variance_err=nan, level=nan, level_err=nan, n_pixels=0)
     rounded = not np.issubdtype(source.pixels.dtype, np.floating)
-    if rounded and np.ptp(pixels) > 0:
+    if rounded and max(np.max(group) for group in groups) > min(map(np.min, groups)):
         # Deviations of whole numbers are whole numbers: spread them over their unit.
-        pixels = pixels + np.random.default_rng(0).uniform(-0.5, 0.5, pixels.size)
+        rng = np.random.default_rng(0)
+        groups = [group + rng.uniform(-0.5, 0.5, group.size) for group in groups]
+    level, raw = _level_and_variance(np.concatenate(groups))
+    variance = max(raw - _ROUNDING, 0.0) if rounded else raw
+    by_chance = raw * math.sqrt(2.0 / (_MAD_EFFICIENCY * n_pixels))
+    scatter = group_error(np.array([_level_and_variance(group)[1] for group in groups]))
+    return BorderNoise(
+        variance=variance,
+        variance_err=float(np.fmax(by_chance, scatter)),
+        level=level,
+        level_err=math.sqrt(0.5 * math.pi * variance / n_pixels),
+        n_pixels=n_pixels,
+    )
+
+
+def _level_and_variance(pixels: NDArray[np.float64]) -> tuple[float, float]:
     level = float(np.median(pixels))
-    variance = float(_SIGMA_PER_MAD * np.median(np.abs(pixels - level))) ** 2
-    if rounded:
-        variance = max(variance - _ROUNDING, 0.0)
-    level_err = math.sqrt(0.5 * math.pi * variance / pixels.size)
-    return BorderNoise(variance=variance, level=level, level_err=level_err, n_pixels=pixels.size)
+    return level, float(_SIGMA_PER_MAD * np.median(np.abs(pixels - level))) ** 2
 
 
-def _border_pixels(source: StampSource) -> NDArray[np.floating[Any]]:
-    """Return the finite border pixels of the whole stamps, or of a fair sample of them."""
+def _border_pixels(source: StampSource) -> list[NDArray[np.float64]]:
+    """Return the finite border pixels of whole stamps, of a fair sample of them, in groups."""
     rows = np.flatnonzero(source.flags == 0)
     if len(rows) > _MOST_STAMPS:
         rows = rows[np.linspace(0, len(rows) - 1, _MOST_STAMPS).astype(np.int64)]
@@ -86,9 +110,6 @@ def _border_pixels(source: StampSource) -> NDArray[np.floating[Any]]:
     width = max(1, min(ny, nx) // 16)
     border = np.ones((ny, nx), dtype=bool)
     border[width : ny - width, width : nx - width] = False
-    parts = [
-        source.take(rows[start : start + _READ_AT_ONCE])[:, border].ravel()
-        for start in range(0, len(rows), _READ_AT_ONCE)
-    ]
-    pixels = np.concatenate(parts) if parts else np.empty(0)
-    return pixels[np.isfinite(pixels)].astype(np.float64, copy=False)
+    groups = np.array_split(rows, min(_GROUPS, max(len(rows), 1)))
+    parts = [source.take(group)[:, border].ravel().astype(np.float64) for group in groups]
+    return [pixels[np.isfinite(pixels)] for pixels in parts]

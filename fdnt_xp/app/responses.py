@@ -1,0 +1,120 @@
+"""What `fdnt-xp measure --responses` does: the response of each galaxy to shear."""
+
+from __future__ import annotations
+
+import hashlib
+import warnings
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdnt_xp.app.backends import Backend
+from fdnt_xp.app.runner import ChunkPsfs, Noise, measure_chunks
+from fdnt_xp.arrays import Array, array_namespace, device_of
+from fdnt_xp.data.images import Pixels
+from fdnt_xp.data.stamps import StampChunk, StampSource
+from fdnt_xp.errors import FdntValueError, FdntWarning
+from fdnt_xp.fourier.psf import Psf
+from fdnt_xp.shears.responses import measure_responses
+from fdnt_xp.shears.sample import default_size
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+_PSFS_AT_ONCE: Final = 256
+
+
+def measure_source_responses(
+    source: StampSource,
+    psf_pixels: Pixels,
+    *,
+    backend: Backend,
+    noise: Noise,
+    oversampling: int = 1,
+    size: float | None = None,
+    seed: int = 0,
+    chunk: int | None = None,
+    quiet: bool = True,
+) -> Table:
+    """Measure the response of every galaxy of a source; memory is that of one chunk.
+
+    Parameters
+    ----------
+    source, psf_pixels, backend, oversampling, size, chunk, quiet
+        As for `measure_source`; without `size`, one weight fits all PSFs.
+    noise : Noise
+        Of the pixels.
+    seed : int
+        Of the synthetic noise. That of a galaxy depends on the seed and on its id alone,
+        not on order or chunks.
+
+    Returns
+    -------
+    astropy.table.Table
+        One row for each galaxy, in order, with the columns of `ResponseResult.to_table`
+        and the step of the frames in `meta["RSTEP"]`.
+
+    Raises
+    ------
+    FdntValueError
+        With JAX in float32.
+    """
+    if (backend.library, backend.dtype) == ("jax", "float32"):
+        raise FdntValueError(
+            "responses need 64-bit integers, which JAX has with --dtype float64 only"
+        )
+    names = galaxy_numbers(source.ids)
+    psfs = ChunkPsfs.of(psf_pixels, source, backend, oversampling)
+    size = size or _common_size(psfs, source.n_gal)
+
+    def measure(part: StampChunk, stamps: Array, psf: Psf) -> Table:
+        xp = array_namespace(stamps=stamps)
+        power = noise.power
+        return measure_responses(
+            stamps,
+            psf,
+            noise_variance=noise.variance if power is None else None,
+            noise_power=None if power is None else backend.from_numpy(power),
+            seed=seed,
+            identifiers=xp.asarray(names[part.rows], dtype=xp.int64, device=device_of(stamps)),
+            size=size,
+        ).to_table()
+
+    return measure_chunks(source, psfs, measure, chunk=chunk, quiet=quiet)
+
+
+def galaxy_numbers(ids: NDArray[Any]) -> NDArray[np.int64]:
+    """Return the numbers by which galaxies have their synthetic noise, shape (n_gal,).
+
+    Whole numbers stay what they are; of anything else it is a hash of the text, 63 bits
+    of BLAKE2b, the same on every machine. Warns (`FdntWarning`) if two galaxies have one
+    id, for they get the same noise.
+    """
+    numbers = np.asarray(ids)
+    if numbers.dtype.kind == "f" and np.all(np.isfinite(numbers) & (numbers == np.rint(numbers))):
+        numbers = numbers.astype(np.int64)
+    if numbers.dtype.kind not in "iu":
+        numbers = np.fromiter(map(_hash, numbers), dtype=np.int64, count=len(numbers))
+    if len(np.unique(numbers)) < len(numbers):
+        warnings.warn(
+            "some galaxies have the same id, and so get the same synthetic noise; errors of "
+            "shear that treat them as independent are too small",
+            FdntWarning,
+            stacklevel=2,
+        )
+    return numbers.astype(np.int64)
+
+
+def _hash(name: Any) -> int:
+    text = name.decode() if isinstance(name, bytes) else str(name)
+    digest = hashlib.blake2b(text.strip().encode(), digest_size=8).digest()
+    return int.from_bytes(digest, "big") >> 1
+
+
+def _common_size(psfs: ChunkPsfs, n_gal: int) -> float | None:
+    """Return the default size for all PSFs together, which no chunk of them knows."""
+    if psfs.common is not None or n_gal == 0:
+        return None
+    starts = range(0, n_gal, _PSFS_AT_ONCE)
+    return min(default_size(psfs.rows(slice(start, start + _PSFS_AT_ONCE))) for start in starts)
