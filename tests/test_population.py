@@ -216,7 +216,7 @@ def test_names_carry_the_noise_into_any_order_and_chunk():
     again = fx.population_null(
         stamps[order], psf, identifiers=names[order], chunk_size=7, **options
     )
-    # The search ends when a step is below a ten-thousandth of the error.
+    # What the search leaves is a ten-thousandth of the error.
     np.testing.assert_allclose(again.g, whole.g, atol=1e-3 * float(np.min(whole.g_err)))
     other = fx.population_null(stamps, psf, identifiers=names, noise_variance=variance, seed=3)
     assert np.all(np.abs(other.g - whole.g) > 1e-3 * whole.g_err)

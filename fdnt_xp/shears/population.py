@@ -34,8 +34,9 @@ _MAX_STEPS: Final = 12
 _TOLERANCE: Final = 1e-9
 _TOLERANCE_FLOAT32: Final = 2e-5
 """Smallest step in gamma worth taking: above the rounding of each galaxy's solution."""
-_TOLERANCE_NOISY, _TOLERANCE_HARD = 1e-4, 3e-2
-"""The same in noisy data, in standard errors; with a hard cut, where the mean has steps."""
+_TOLERANCE_NOISY, _TOLERANCE_HARD = 1e-2, 3e-2
+"""The same in noisy data, in standard errors; with a hard cut, where the mean has steps. The
+last step is taken, and what it leaves is smaller by the error of the response, 1e-3."""
 _SLOPE_SEEN: Final = 1e-3
 """Least step in gamma from which a slope is learnt where hard cuts make the mean rough."""
 _DEFAULT_SHEAR: Final = 0.1
