@@ -47,7 +47,8 @@ class KnownNoise:
     identifiers, symmetry : array of int64, shape (n_gal,)
     seed : int
         Of the synthetic noise, as `population_null` is told.
-    softening : float
+    softening, max_shear : float
+        Of `population_null`; for `measure_responses` its step is the reach.
     """
 
     clean: Real
@@ -57,7 +58,8 @@ class KnownNoise:
     identifiers: NDArray[np.int64]
     symmetry: NDArray[np.int64]
     seed: int
-    softening: float
+    softening: float = 1.0
+    max_shear: float = 0.1
 
 
 def second_order(known: KnownNoise, gamma: Gamma) -> Real:
@@ -76,7 +78,7 @@ def second_order(known: KnownNoise, gamma: Gamma) -> Real:
         weight=None,
         size=None,
         softening=known.softening,
-        max_shear=0.1,
+        max_shear=known.max_shear,
         padding=1,
         chunk_size=None,
         noise=NoiseOptions(
