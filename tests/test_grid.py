@@ -177,3 +177,36 @@ def test_the_opposite_shear_gives_the_grid_back(gamma):
     grid = half_plane_disc(np, (7, 8), KMAX, dtype=np.float64, device="cpu")
     back = grid.sheared(gamma).sheared(-gamma)
     np.testing.assert_allclose([back.kx, back.ky], [grid.kx, grid.ky], atol=1e-13)
+
+
+# --- names of the modes --------------------------------------------------------------
+
+
+@each_shape
+def test_rows_and_columns_name_the_modes(shape, dtype, make_grid, to_np):
+    grid = make_grid(shape, KMAX, dtype)
+    row, column = (to_np(part) for part in grid.row_and_column)
+    kx = 2.0 * np.pi * np.fft.rfftfreq(shape[1])[column]
+    ky = 2.0 * np.pi * np.fft.fftfreq(shape[0])[row]
+    tolerances = tolerance("algebra", dtype)
+    np.testing.assert_allclose(to_np(grid.kx), kx, **tolerances)
+    np.testing.assert_allclose(to_np(grid.ky), ky, **tolerances)
+
+
+@pytest.mark.parametrize("side", [8, 9])
+def test_a_quarter_turn_of_the_image_moves_its_modes(side, make_grid, xp, to_np):
+    grid = make_grid((side, side), KMAX, xp.float64)
+    source, sign = (to_np(part) for part in grid.quarter_turn)
+    image = np.random.default_rng(0).standard_normal((side, side))
+
+    def modes(pixels):
+        """Return the transform about the middle of the image."""
+        kx, ky = to_np(grid.kx), to_np(grid.ky)
+        x = np.arange(side) - 0.5 * (side - 1)
+        waves = np.exp(-1j * (kx[:, None, None] * x + ky[:, None, None] * x[:, None]))
+        return np.sum(pixels * waves, axis=(1, 2))
+
+    # y is up: counter-clockwise is clockwise for NumPy.
+    straight, turned = modes(image), modes(np.rot90(image, -1))
+    np.testing.assert_allclose(turned.real, straight.real[source], atol=1e-12)
+    np.testing.assert_allclose(turned.imag, sign * straight.imag[source], atol=1e-12)

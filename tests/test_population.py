@@ -17,7 +17,7 @@ from fdnt_xp.errors import (
     RangeError,
     ShapeMismatchError,
 )
-from fdnt_xp.shears.population import find_null
+from fdnt_xp.shears.null_search import find_null
 from fdnt_xp.shears.weights import ShapeWeight
 from images import SHEAR, ring, star
 from tolerances import tolerance

@@ -271,6 +271,18 @@ def test_take_reorders_and_repeats(three, xp, dtype, to_xp):
     assert (taken.oversampling, taken.largest_kmax) == (stack.oversampling, stack.largest_kmax)
 
 
+def test_a_higher_floor_ends_the_weight_where_the_power_falls_below(three, dtype, to_np):
+    _, psf = three
+    higher = psf.ending_at(0.03)
+    assert higher.kmax.dtype == higher.weight.coefficients[0].dtype == dtype
+    assert higher.largest_kmax == pytest.approx(float(np.max(to_np(higher.kmax))))
+    direct = Psf.from_image(psf.image, floor=0.03)
+    # The table of the first has its own smooth end, of no weight where the second's is.
+    np.testing.assert_allclose(to_np(higher.kmax), to_np(direct.kmax), rtol=2e-3)
+    again = psf.ending_at(1e-12)
+    np.testing.assert_allclose(to_np(again.kmax), to_np(psf.kmax), rtol=0.02)
+
+
 def test_restricted_marks_what_ends_too_early(three, to_np):
     _, stack = three
     kmax = to_np(stack.kmax)

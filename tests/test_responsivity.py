@@ -116,6 +116,18 @@ def test_named_derivatives_are_the_derivatives(make, scale):
         assert np.max(np.abs(error)) * scale**power < 1e-10
 
 
+def test_a_bisquare_weight_ends():
+    weight = ShapeWeight.bisquare(1.5)
+    x = np.linspace(0.0, 1.2, 25)  # the stencil must not reach the end, where w'' jumps
+    bare = ShapeWeight(function=weight.function, scale=0.5)
+    given, numerical = weight.expand(x), bare.expand(x)
+    for name in ("first", "second", "third", "ratio"):
+        np.testing.assert_allclose(getattr(given, name), getattr(numerical, name), atol=1e-8)
+    beyond = weight.expand(np.array([1.5, 2.0]))
+    for name in ("value", "first", "second", "third", "ratio"):
+        np.testing.assert_array_equal(getattr(beyond, name), 0.0)
+
+
 def test_ellipticity_gradient(xp, dtype, to_xp):
     # R1 = ½ [(eta w' + w)/(1 - EG) + Y w], with w = exp(-eta²).
     eta, eg = np.array([0.0, 0.3, 0.8, 1.5]), np.array([0.02, -0.08, 0.3, -4.0])

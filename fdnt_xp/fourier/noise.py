@@ -27,7 +27,7 @@ from fdnt_xp.fourier.interpolation import cubic_table
 from fdnt_xp.fourier.psf import Psf, power_on_circles, transform_on_modes
 from fdnt_xp.fourier.transform import DeconvolvedStamps, complex_like
 
-_RADII, _ANGLES = 41, 32
+_RADII, _ANGLES = 25, 24
 """Of the polar table of ln V: circles, and points on half of each. In the angle it is a
 trigonometric polynomial, in the radius a cubic."""
 _DIRECTIONS: Final = 64

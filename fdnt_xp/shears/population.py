@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -23,6 +22,7 @@ from fdnt_xp.shears.cuts import CutLike, Selection
 from fdnt_xp.shears.estimate import ShearEstimate
 from fdnt_xp.shears.frames import FrameSample, Gamma, SampleValues
 from fdnt_xp.shears.masks import Masked
+from fdnt_xp.shears.null_search import OutOfReachError, find_null
 from fdnt_xp.shears.ratio import over_response, ratio_errors
 from fdnt_xp.shears.sample import LARGEST_SHEAR, NoiseOptions, StatisticName, make_sample
 from fdnt_xp.shears.weights import ShapeWeight
@@ -30,7 +30,6 @@ from fdnt_xp.shears.weights import ShapeWeight
 STEP: Final = 0.02
 """Step in gamma of numerical responses: far above the solver's noise, and its error, of
 second order in the step, changes the speed of the search, not its root."""
-_MAX_STEPS: Final = 12
 _TOLERANCE: Final = 1e-9
 _TOLERANCE_FLOAT32: Final = 2e-5
 """Smallest step in gamma worth taking: above the rounding of each galaxy's solution."""
@@ -46,10 +45,6 @@ _LEAST_SNR_ETA: Final = 50.0
 """Median S/N below which solved shapes fail too often, and jump from root to root."""
 _POWER_STEP: Final = 0.1
 """Relative change of the noise power that shows how the shear depends on it."""
-
-
-class OutOfReachError(FdntValueError):
-    """The null, if there is one, lies beyond the shears that the weight's disc allows."""
 
 
 def population_null(
@@ -343,70 +338,6 @@ class _Weighed:
             raise FdntValueError(
                 f"the cut keeps {self.counted} of {self.found} galaxies; a null needs two"
             )
-
-
-def find_null(
-    mean: Callable[[tuple[float, float]], tuple[float, float]],
-    at_start: tuple[float, float],
-    jac: list[tuple[float, float]],
-    *,
-    start: Gamma = (0.0, 0.0),
-    largest: float,
-    tolerance: float,
-    least_secant: float = 0.0,
-) -> tuple[float, float]:
-    """Find the gamma at which a mean of two components vanishes.
-
-    Parameters
-    ----------
-    mean : callable
-        From gamma to the mean.
-    at_start : tuple of float
-        Its value at the start.
-    jac : list of 2 tuples
-        Its derivative there, rows by component of the mean.
-    start : tuple of float
-        Where to begin.
-    largest : float
-        Largest `|gamma|` that may be asked for.
-    tolerance : float
-        A step smaller than this ends the search.
-    least_secant : float
-        The derivative learns nothing from steps shorter than this.
-
-    Raises
-    ------
-    FdntValueError
-        If the response is singular, or the search does not end.
-    OutOfReachError
-        If it leaves the range.
-    """
-    (a, b), (c, d) = jac
-    x, y = start
-    f1, f2 = at_start
-    for _ in range(_MAX_STEPS):
-        det = a * d - b * c
-        if not (math.isfinite(det) and abs(det) > 1e-12 * (a * a + b * b + c * c + d * d)):
-            raise FdntValueError("the sample's mean shape does not respond to shear")
-        sx, sy = -(d * f1 - b * f2) / det, -(a * f2 - c * f1) / det
-        if math.hypot(sx, sy) < tolerance:
-            return x + sx, y + sy
-        x, y = x + sx, y + sy
-        if not math.hypot(x, y) <= largest:
-            raise OutOfReachError(
-                f"no null within max_shear: the search went to |g| = "
-                f"{math.tanh(0.5 * math.hypot(x, y)):.3g}, allowed is "
-                f"{math.tanh(0.5 * largest):.3g}; raise max_shear if so large a shear is meant"
-            )
-        f1, f2 = mean((x, y))
-        # Broyden: the least change of the response that explains the value just seen. What
-        # the linear model left over is f itself, since the step was Newton's.
-        size = sx * sx + sy * sy
-        if size < least_secant**2:
-            continue
-        a, b = a + f1 * sx / size, b + f1 * sy / size
-        c, d = c + f2 * sx / size, d + f2 * sy / size
-    raise FdntValueError(f"no null found in {_MAX_STEPS} steps")
 
 
 def _count(flags: Array, flag: Flag) -> int:
