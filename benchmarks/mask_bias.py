@@ -27,10 +27,11 @@ from fdnt_xp.data.noise_bias import Population, draw_versions
 from fdnt_xp.data.noise_control import KnownNoise, second_order
 from fdnt_xp.fourier.missing import fill_missing
 from fdnt_xp.fourier.psf import Psf
+from fdnt_xp.shapes.gl_fit import filled, fit_laguerre
 from fdnt_xp.shears.sample import NoiseOptions, make_sample
 
 HOLES = ("random 1 %", "random 5 %", "cosmic ray", "column", "far column", "corner")
-TREATMENTS = ("zero", "neighbours", "opposite", "fourfold", "fill")
+TREATMENTS = ("zero", "neighbours", "opposite", "fourfold", "laguerre", "fill")
 BATCH, STEP = 512, 0.02
 FOOTPRINT = 10.5
 SYMMETRY = np.repeat([0, 1, 4, 5], BATCH)
@@ -57,8 +58,15 @@ def holes(kind: str, rng: np.random.Generator, n: int, size: int) -> np.ndarray:
     return mask
 
 
-def treated(stamps: np.ndarray, mask: np.ndarray, treatment: str, psf: Psf) -> np.ndarray:
-    """Return stamps with something in their holes."""
+def treated(
+    stamps: np.ndarray,
+    mask: np.ndarray,
+    treatment: str,
+    psf: Psf,
+    variance: float,
+    noise: np.ndarray,
+) -> np.ndarray:
+    """Return stamps with something in their holes; `noise` is more of it, of unit variance."""
     if treatment == "neighbours":
         there = (~mask).astype(float)
         sums, weights = (ndimage.gaussian_filter(a, (0, 1, 1)) for a in (stamps * there, there))
@@ -66,6 +74,14 @@ def treated(stamps: np.ndarray, mask: np.ndarray, treatment: str, psf: Psf) -> n
     if treatment == "opposite":
         across = np.where(mask, 0.0, stamps)[:, ::-1, ::-1]
         return np.where(mask, across, stamps)
+    if treatment == "laguerre":
+        ivar = np.where(mask, 0.0, 1.0 / variance)
+        stamps = np.where(mask, 0.0, stamps)
+        fit = fit_laguerre(stamps, ivar, order=12, chunk_size=256)
+        model = filled(stamps, ivar, fit)
+        # Pixels without noise would be another kind of hole.
+        model = model + np.where(mask, math.sqrt(variance) * noise, 0.0)
+        return np.where(np.isnan(model), treated(stamps, mask, "fill", psf, variance, noise), model)
     if treatment == "fourfold":
         mask = np.any([np.rot90(mask, k, axes=(1, 2)) for k in range(4)], axis=0)
     if treatment == "fill":
@@ -101,6 +117,8 @@ def measure(kind: str, treatment: str, snr: float, n_stamps: int) -> dict[str, A
         # Holes in places of their own turn with the galaxy, as all else but the PSF.
         random = kind.startswith("random") or kind == "cosmic ray"
         mask = np.concatenate([mask, turned(mask) if random else mask] * 2)
+        more = rng.standard_normal((BATCH, *versions.stamps.shape[-2:]))
+        more = np.concatenate([more, turned(more), -more, -turned(more)])
         names = number * BATCH + np.tile(np.arange(BATCH), 4)
         pair = []
         for minus, sign in enumerate((1.0, -1.0)):
@@ -116,7 +134,7 @@ def measure(kind: str, treatment: str, snr: float, n_stamps: int) -> dict[str, A
                 softening=1.0,
             )
             sample = make_sample(
-                treated(clean + noise, mask, treatment, psf),
+                treated(clean + noise, mask, treatment, psf, sigma**2, more),
                 psf,
                 statistic="frozen",
                 weight=None,

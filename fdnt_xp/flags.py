@@ -31,10 +31,12 @@ class Flag(IntFlag):
     """The null tests do not respond to the parameters at the solution."""
     TOO_ELLIPTICAL = 1 << 12
     """The root lies where the weight covers too little of k-space to trust it."""
+    GL_FAILURE = 1 << 13
+    """The pixels that are there do not carry a Gauss-Laguerre fit, or no basis matches."""
     NO_ATTEMPT = 1 << 14
     """The galaxy was never measured (set until something clears it)."""
     NON_FINITE_PIXEL = 1 << 15
-    """A pixel of the stamp is NaN or infinite."""
+    """A pixel of the stamp or its `ivar` is NaN or infinite, or the latter negative."""
     NO_SIGNAL = 1 << 16
     """The stamp is constant, or its flux under the weight is not positive."""
     BAD_PSF = 1 << 17
@@ -48,7 +50,7 @@ class Flag(IntFlag):
     LOST_IN_FRAME = 1 << 21
     """No centroid was found in one of the counter-sheared frames, where the galaxy counts 0."""
     MASKED = 1 << 22
-    """Pixels are missing, too many to be filled or not to be filled."""
+    """Pixels are missing: more than the method can do without, or all of them."""
     FILLED = 1 << 23
     """Missing pixels were filled from the others."""
 
@@ -88,6 +90,7 @@ _TEXT: Final[dict[str, str]] = {
     "DID_NOT_CONVERGE": "iteration limit reached",
     "SINGULAR": "null tests do not respond at the solution",
     "TOO_ELLIPTICAL": "weight covers too little of k-space",
+    "GL_FAILURE": "no Gauss-Laguerre fit to the pixels",
     "NO_ATTEMPT": "never measured",
     "NON_FINITE_PIXEL": "NaN or infinite pixel",
     "NO_SIGNAL": "no positive flux",

@@ -14,6 +14,7 @@ import click
 
 import fdnt_xp
 from fdnt_xp.app.backends import BACKENDS, DTYPES
+from fdnt_xp.app.check import CheckOptions, run_check
 from fdnt_xp.app.demo import Field, run_demo
 from fdnt_xp.app.gradient_figure import GradientFigure, draw_gradient_figure
 from fdnt_xp.app.measure import Inputs, Settings, measure_files
@@ -22,6 +23,7 @@ from fdnt_xp.app.ring import RingOptions, run_ring
 from fdnt_xp.app.shear import catalog_shear, report_lines
 from fdnt_xp.app.summary import summary_lines
 from fdnt_xp.data.catalog import check_catalog, read_catalog, write_catalog
+from fdnt_xp.data.noise_bias import ESTIMATORS, KINDS
 from fdnt_xp.errors import FdntError, FdntWarning
 
 _F = TypeVar("_F", bound=Callable[..., Any])
@@ -353,6 +355,65 @@ def ring(output: str | None, figure: str | None, overwrite: bool, **options: Any
     pixels, shapes are distortions (a^2-b^2)/(a^2+b^2), the shear is conformal (eta).
     """
     for line in run_ring(RingOptions(**options), output, figure, overwrite=overwrite):
+        click.echo(line)
+
+
+@main.command(cls=_Command)
+@click.option(
+    "--snr",
+    default="10,15,20,50",
+    show_default=True,
+    metavar="S/N,...",
+    help="sqrt(<sum I^2>)/sigma.",
+)
+@click.option(
+    "--kind", type=click.Choice(KINDS), default="exp", show_default=True, help="Galaxies to draw."
+)
+@click.option(
+    "--radius",
+    metavar="PIXELS",
+    help="Half-light radius, or LOW,HIGH. [default: 2.3; for mixed 1.3,2.3]",
+)
+@click.option("--psf-e", type=float, default=0.1, show_default=True, help="e1 of it; e2 is half.")
+@click.option("--shear", type=float, default=0.02, show_default=True, help="Applied g, along x.")
+@click.option(
+    "--estimator",
+    "estimators",
+    multiple=True,
+    default=["null"],
+    show_default=True,
+    metavar="NAME,...",
+    help=f"One or more of {', '.join(ESTIMATORS)}.",
+)
+@click.option("--galaxies", type=int, default=1024, show_default=True, help="Different ones.")
+@click.option(
+    "--stamps",
+    type=int,
+    default=100_000,
+    show_default=True,
+    help="Noisy stamps to measure for each S/N with each estimator.",
+)
+@click.option(
+    "--batch",
+    type=int,
+    default=1024,
+    show_default=True,
+    help="Galaxies, each 8 stamps, that make one m; the scatter of m makes the error.",
+)
+@click.option("--padding", type=int, default=1, show_default=True, help="Makes the k grid finer.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Of everything random.")
+@click.option("-o", "--output", metavar="JSON", help="Results to write: .json.")
+@click.option("--plot", "figure", metavar="FIGURE", help="Plot to write: .png, .pdf or .svg.")
+@_WHERE
+@_OVERWRITE
+def check(output: str | None, figure: str | None, overwrite: bool, **options: Any) -> None:
+    """Put noise on galaxies of known shear, and see what bias it makes.
+
+    Prints the multiplicative and additive bias of each estimator of shear at each S/N, with
+    errors, and the error of the shear from one galaxy. Fractions of a per cent want 100 000
+    stamps and more at low S/N.
+    """
+    for line in run_check(CheckOptions(**options), output, figure, overwrite=overwrite):
         click.echo(line)
 
 

@@ -13,53 +13,30 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from functools import lru_cache
 from types import ModuleType
 from typing import Final
-
-import numpy as np
-from numpy.typing import NDArray
 
 from fdnt_xp.arrays import Array, array_namespace, as_floating, device_of, require_dtype
 from fdnt_xp.errors import FdntValueError, RangeError, ShapeMismatchError
 from fdnt_xp.flags import Flag
-from fdnt_xp.nulltests.dogleg import DoglegOptions, RootResult, Status, find_root
-from fdnt_xp.nulltests.tests import inverse_if_positive
+from fdnt_xp.nulltests.dogleg import RootResult, Status
+from fdnt_xp.shapes.gl_matching import (
+    basis_at,
+    fit_pixels,
+    match_basis,
+    screened_basis,
+    starting_moments,
+)
 from fdnt_xp.shapes.job import check_count
 from fdnt_xp.shapes.laguerre import (
     LaguerreBasis,
     check_order,
-    generators,
     n_coefficients,
     pixel_positions,
-    position,
 )
+from fdnt_xp.shapes.least_squares import LARGEST_INFLATION
 
-LARGEST_INFLATION: Final = 20.0
-"""Inflation of a variance beyond which a fit is degenerate. Masks of a tenth of the pixels or a
-column through the centre give 1.2, three columns 5, a quadrant cut off at the centre 1e6."""
-_RESPONSE_ORDER: Final = 4
-"""What moves coefficients of order 2 is of order 4 at most."""
-_MATCHING_ORDER: Final = 6
-"""The matched basis hardly depends on the order of the fit that finds it, the cost very much."""
-_RIDGE: Final = 10.0
-"""In eps times the number of coefficients: more than rounding can take off an eigenvalue."""
-_REFINEMENTS: Final = 2
-_WINDOW: Final = 0.08
-"""Size of the window of the first moments, in sides of the stamp."""
-_SMALLEST: Final = 0.3
-"""Least size of a basis, pixels: narrower functions fall between the pixels."""
-_LARGEST: Final = 0.5
-"""Largest size, in sides of the stamp."""
-_MOST_ELLIPTICAL: Final = 4.0
 _BYTES_AT_ONCE: Final = 128e6
-_TESTS: Final = (
-    position(1, 0),
-    position(1, 0, sine=True),
-    position(2, 0),
-    position(2, 0, sine=True),
-    position(1, 1),
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,13 +55,13 @@ class LaguerreFit:
     coefficients_cov : array, shape (n_gal, n_coef, n_coef)
         Their covariance at fixed basis, if `ivar` is the inverse variance of the pixels.
     inflation : array, shape (n_gal,)
-        Largest `M_jj (M^-1)_jj` of the normal matrix M: how much the variance of a
-        coefficient grows because the pixels left cannot tell it from others. 1 where they
-        can; infinite where there are fewer pixels than coefficients.
+        How much the variance of a coefficient grows because the pixels left cannot tell it
+        from others, see `LinearFit`.
     n_pixels : array, shape (n_gal,), int32
         Pixels that were fitted.
     flags : array, shape (n_gal,), int32
-        Bits of `fdnt_xp.flags.Flag`; SINGULAR where the fit is degenerate.
+        Bits of `fdnt_xp.flags.Flag`; GL_FAILURE where there is no fit, with the reason where
+        the pixels are not it: no basis matches.
     n_iter, status : array, shape (n_gal,), int32
         Evaluations of the basis' null tests, and how their solution ended, a `Status`; 0
         where the basis was given.
@@ -103,6 +80,26 @@ class LaguerreFit:
     def usable(self) -> Array:
         """True where the fit holds, shape (n_gal,), bool."""
         return self.flags == 0
+
+    def harmless(self) -> LaguerreFit:
+        """Return the fits with zeros in place of those that are not usable."""
+        xp = array_namespace(flags=self.flags)
+
+        def usable_or(values: Array, other: float) -> Array:
+            mask = xp.reshape(self.usable, (-1,) + (1,) * (values.ndim - 1))
+            return xp.where(mask, values, xp.full_like(values, other))
+
+        return replace(
+            self,
+            basis=replace(
+                self.basis,
+                eta=usable_or(self.basis.eta, 0.0),
+                centroid=usable_or(self.basis.centroid, 0.0),
+                size=usable_or(self.basis.size, 1.0),
+            ),
+            coefficients=usable_or(self.coefficients, 0.0),
+            coefficients_cov=usable_or(self.coefficients_cov, 0.0),
+        )
 
     def take(self, rows: Array) -> LaguerreFit:
         """Return the fits of the given galaxies (integer array), in that order."""
@@ -124,23 +121,6 @@ class LaguerreFit:
 
 
 _COLUMNS: Final = tuple(field.name for field in fields(LaguerreFit) if field.name != "basis")
-
-
-@dataclass(frozen=True, kw_only=True)
-class LinearFit:
-    """Weighted least squares of each galaxy; see `LaguerreFit` for `inflation`.
-
-    Parameters
-    ----------
-    coefficients, covariance, inflation, n_pixels : array
-        Shapes (n_gal, n_coef), (n_gal, n_coef, n_coef), (n_gal,), (n_gal,). Finite, and
-        without meaning where `inflation` is infinite.
-    """
-
-    coefficients: Array
-    covariance: Array
-    inflation: Array
-    n_pixels: Array
 
 
 def fit_laguerre(
@@ -222,7 +202,7 @@ def fit_laguerre(
         pixels, weights, flags = _screened(xp, stamps[rows, :, :], ivar[rows, :, :])
         basis = _starting_basis(pixels, weights, order, here)
         root = match_basis(basis, pixels, weights, max_iter) if matched else None
-        basis = basis if root is None else _basis_at(root.x, basis)
+        basis = basis if root is None else basis_at(root.x, basis)
         basis = replace(basis, size=scale * basis.size)
         parts.append(_described(basis, pixels, weights, root, flags))
     return LaguerreFit.concat(parts)
@@ -247,165 +227,19 @@ def filled(stamps: Array, ivar: Array, fit: LaguerreFit) -> Array:
     return xp.where(ivar > 0, stamps, xp.reshape(model, stamps.shape))
 
 
-def least_squares(functions: Array, pixels: Array, ivar: Array) -> LinearFit:
-    """Fit a sum of functions to the pixels of each galaxy, by Cholesky's normal equations.
-
-    Parameters
-    ----------
-    functions : array, shape (n_gal, n_coef, n_pix)
-        Finite.
-    pixels, ivar : array, shape (n_gal, n_pix)
-        Finite where ivar > 0; ivar >= 0.
-
-    Notes
-    -----
-    The matrix is scaled to a unit diagonal and gets a ridge above its rounding, so that the
-    factorisation cannot fail, for one would fail the batch; the ridge is taken back by
-    iterated refinement of the coefficients. The covariance keeps it: a relative error of
-    the ridge, 2e-13 (in float32 1e-4) at 91 coefficients, times the inflation.
-    """
-    xp = array_namespace(functions=functions, pixels=pixels, ivar=ivar)
-    n_coef = int(functions.shape[1])
-    brightest = xp.max(ivar, axis=-1)
-    unit = xp.where(brightest > 0, brightest, xp.ones_like(brightest))
-    weighted = functions * (ivar / unit[:, None])[:, None, :]
-    normal = xp.matmul(weighted, xp.matrix_transpose(functions))
-    right = _times(weighted, xp.where(ivar > 0, pixels, xp.zeros_like(pixels)))
-
-    n_pixels = xp.sum(xp.astype(ivar > 0, xp.int32), axis=-1, dtype=xp.int32)
-    diagonal = xp.linalg.diagonal(normal)
-    seen = xp.all(diagonal > float(xp.finfo(normal.dtype).smallest_normal) ** 0.5, axis=-1)
-    fair = seen & (n_pixels >= n_coef) & xp.all(xp.isfinite(right), axis=-1)
-    norm = 1.0 / xp.sqrt(xp.where(fair[:, None], diagonal, xp.ones_like(diagonal)))
-    eye = xp.eye(n_coef, dtype=normal.dtype, device=device_of(normal))[None, :, :]
-    both = norm[:, :, None] * norm[:, None, :]
-    normal = xp.where(fair[:, None, None], normal * both, eye)
-    right = xp.where(fair[:, None], norm * right, xp.zeros_like(right))
-
-    ridge = _RIDGE * n_coef * float(xp.finfo(normal.dtype).eps)
-    root = xp.linalg.inv(xp.linalg.cholesky(normal + ridge * eye))
-    inverse = xp.matmul(xp.matrix_transpose(root), root)
-    solution = _times(inverse, right)
-    for _ in range(_REFINEMENTS):
-        solution = solution + _times(inverse, right - _times(normal, solution))
-    inflation = xp.max(xp.linalg.diagonal(inverse), axis=-1)
-    return LinearFit(
-        coefficients=norm * solution,
-        covariance=inverse * both / unit[:, None, None],
-        inflation=xp.where(fair, inflation, xp.full_like(inflation, float("inf"))),
-        n_pixels=n_pixels,
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class BasisTests:
-    """The null tests of the basis: a `RootProblem` in `(x0/L, y0/L, eta1, eta2, ln sigma)`.
-
-    They are `b10`, `b20` and `b11` over `b00`. Moving the basis changes the coefficients by
-    the generators of `laguerre`: exact for a complete basis over the whole plane, close
-    enough to Newton's method for others.
-
-    Parameters
-    ----------
-    stamps, ivar : array, shape (n_gal, ny, nx)
-    start : LaguerreBasis
-        Its sizes are L. The origin of (x0, y0) is that of its centroids.
-    """
-
-    stamps: Array
-    ivar: Array
-    start: LaguerreBasis
-
-    def take(self, rows: Array) -> BasisTests:
-        """Return the tests of the given galaxies (integer array)."""
-        xp = array_namespace(rows=rows)
-        return BasisTests(
-            stamps=xp.take(self.stamps, rows, axis=0),
-            ivar=xp.take(self.ivar, rows, axis=0),
-            start=self.start.take(rows),
-        )
-
-    def evaluate(self, x: Array) -> tuple[Array, Array]:
-        """Return the tests, shape (n_gal, 5), and their Jacobian, (n_gal, 5, 5).
-
-        NaN where the fit is degenerate, b00 not positive, or the basis absurd.
-        """
-        xp = array_namespace(x=x)
-        basis = _basis_at(x, self.start)
-        basis, sane = _screened_basis(basis, min(self.stamps.shape[1:]))
-        fit = _fit(basis, self.stamps, self.ivar)
-        b00 = fit.coefficients[:, 0]
-        sane = sane & (fit.inflation < LARGEST_INFLATION)
-        inverse = inverse_if_positive(xp.where(sane, b00, -xp.ones_like(b00)))[:, None]
-        f = xp.stack([fit.coefficients[:, j] for j in _TESTS], axis=-1) * inverse
-        slopes = xp.matmul(basis.moves(self.start.size), _responses(fit))
-        jac = (slopes[:, :, 1:] - slopes[:, :, :1] * f[:, None, :]) * inverse[:, :, None]
-        return f, xp.matrix_transpose(jac)
-
-
-def match_basis(start: LaguerreBasis, stamps: Array, ivar: Array, max_iter: int) -> RootResult:
-    """Solve the null tests of the basis, all galaxies at once; x as in `BasisTests`."""
-    xp = array_namespace(stamps=stamps)
-    nan = xp.full_like(start.size, float("nan"))
-    start = replace(start, size=xp.where(start.size > 0, start.size, nan))
-    length = start.size[:, None]
-    x0 = xp.concat([start.centroid / length, start.eta, xp.log(length)], axis=-1)
-    order = max(_RESPONSE_ORDER, min(start.order, _MATCHING_ORDER))
-    start = replace(start, order=order)
-    options = DoglegOptions(
-        ftol=float(xp.finfo(stamps.dtype).eps) ** 0.5, max_iter=max_iter, max_radius=2.0
-    )
-    return find_root(BasisTests(stamps=stamps, ivar=ivar, start=start), x0, options=options)
-
-
-def starting_moments(stamps: Array, ivar: Array) -> tuple[Array, Array]:
-    """Return a first centroid from the centre of the stamp, (n_gal, 2), and size, (n_gal,).
-
-    Moments under a Gaussian window that follows the centroid, corrected for the window as
-    for a Gaussian galaxy; missing pixels count 0. They are for starts, not for results.
-    """
-    xp = array_namespace(stamps=stamps, ivar=ivar)
-    n_gal, ny, nx = (int(n) for n in stamps.shape)
-    x, y = pixel_positions(xp, stamps)
-    image = xp.reshape(xp.where(ivar > 0, stamps, xp.zeros_like(stamps)), (n_gal, ny * nx))
-    square = (_WINDOW * min(ny, nx)) ** 2
-    zero = xp.zeros_like(image[:, 0])
-    x0, y0, size = zero, zero, xp.full_like(zero, 0.5 * square**0.5)
-    for _ in range(4):
-        dx, dy = x[None, :] - x0[:, None], y[None, :] - y0[:, None]
-        weighted = image * xp.exp((dx * dx + dy * dy) * (-0.5 / square))
-        flux, mean_x, mean_y, second = (
-            xp.sum(weighted * f, axis=-1)
-            for f in (xp.ones_like(dx), dx, dy, 0.5 * (dx * dx + dy * dy))
-        )
-        seen = flux > 0
-        flux = xp.where(seen, flux, xp.ones_like(flux))
-        mean_x, mean_y = mean_x / flux, mean_y / flux
-        width = second / flux - 0.5 * (mean_x * mean_x + mean_y * mean_y)
-        least, most = xp.ones_like(width), xp.full_like(width, 0.8 * square)
-        width = xp.minimum(xp.maximum(width, least), xp.maximum(least, most))
-        # A Gaussian of variance v under the window has 1/width = 1/v + 1/square.
-        gain = 1.0 / xp.maximum(1.0 - width / square, xp.full_like(width, 0.2))
-        near = (xp.abs(x0 + gain * mean_x) < 0.5 * nx) & (xp.abs(y0 + gain * mean_y) < 0.5 * ny)
-        x0 = xp.where(seen & near, x0 + gain * mean_x, x0)
-        y0 = xp.where(seen & near, y0 + gain * mean_y, y0)
-        size = xp.where(seen, xp.sqrt(gain * width), size)
-    return xp.stack([x0, y0], axis=-1), size
-
-
 def _described(
     basis: LaguerreBasis, stamps: Array, ivar: Array, root: RootResult | None, flags: Array
 ) -> LaguerreFit:
     """Fit at the basis found, and say of each galaxy whether that means anything."""
     xp = array_namespace(stamps=stamps)
-    basis, sane = _screened_basis(basis, min(stamps.shape[1:]))
-    fit = _fit(basis, stamps, ivar)
-    reasons = [(Flag.SINGULAR, ~(fit.inflation < LARGEST_INFLATION) | ~sane)]
+    basis, sane = screened_basis(basis, min(stamps.shape[1:]))
+    fit = fit_pixels(basis, stamps, ivar)
+    reasons = [(Flag.GL_FAILURE, ~(fit.inflation < LARGEST_INFLATION) | ~sane)]
     if root is not None:
         reasons += [
             (Flag.NO_SIGNAL, root.status == int(Status.NON_FINITE)),
-            (Flag.RADIUS_TOO_SMALL, root.status == int(Status.RADIUS_TOO_SMALL)),
-            (Flag.DID_NOT_CONVERGE, ~root.success),
+            (Flag.GL_FAILURE | Flag.RADIUS_TOO_SMALL, root.status == int(Status.RADIUS_TOO_SMALL)),
+            (Flag.GL_FAILURE | Flag.DID_NOT_CONVERGE, ~root.success),
         ]
     for flag, holds in reasons:
         flags = xp.where((flags == 0) & holds, xp.full_like(flags, int(flag)), flags)
@@ -429,57 +263,6 @@ def _described(
         n_iter=xp.zeros_like(flags) if root is None else root.n_eval,
         status=xp.zeros_like(flags) if root is None else root.status,
     )
-
-
-def _fit(basis: LaguerreBasis, stamps: Array, ivar: Array) -> LinearFit:
-    xp = array_namespace(stamps=stamps)
-    n_gal, ny, nx = stamps.shape
-    functions = basis.in_x(*pixel_positions(xp, stamps))
-    flat = (n_gal, ny * nx)
-    return least_squares(functions, xp.reshape(stamps, flat), xp.reshape(ivar, flat))
-
-
-def _basis_at(x: Array, like: LaguerreBasis) -> LaguerreBasis:
-    """Return the basis of the unknowns of `BasisTests`."""
-    xp = array_namespace(x=x)
-    return LaguerreBasis(
-        order=like.order,
-        eta=x[:, 2:4],
-        centroid=like.size[:, None] * x[:, :2],
-        size=xp.exp(x[:, 4]),
-    )
-
-
-def _screened_basis(basis: LaguerreBasis, side: int) -> tuple[LaguerreBasis, Array]:
-    """Return bases that do no harm, unit circles where absurd, and where they are not."""
-    xp = array_namespace(size=basis.size)
-    sane = xp.sum(basis.eta**2, axis=-1) < _MOST_ELLIPTICAL**2
-    sane = sane & xp.all(xp.abs(basis.centroid) < side, axis=-1)
-    sane = sane & (basis.size > _SMALLEST) & (basis.size < _LARGEST * side)
-    zero = xp.zeros_like(basis.eta)
-    safe = LaguerreBasis(
-        order=basis.order,
-        eta=xp.where(sane[:, None], basis.eta, zero),
-        centroid=xp.where(sane[:, None], basis.centroid, zero),
-        size=xp.where(sane, basis.size, xp.ones_like(basis.size)),
-    )
-    return safe, sane
-
-
-def _responses(fit: LinearFit) -> Array:
-    """Return what each generator does to b00 and to the tests, shape (n_gal, 6, 6)."""
-    xp = array_namespace(b=fit.coefficients)
-    matrix = _test_generators()
-    b = fit.coefficients[:, : matrix.shape[0]]
-    like = {"dtype": b.dtype, "device": device_of(b)}
-    return xp.reshape(xp.matmul(b, xp.asarray(matrix, **like)), (-1, 6, 6))
-
-
-@lru_cache
-def _test_generators() -> NDArray[np.float64]:
-    """Return (n_coef, 6 6): coefficients by generator and row, for one matrix product."""
-    rows = generators(_RESPONSE_ORDER)[:, [0, *_TESTS], :]
-    return np.reshape(rows, (36, -1)).T.copy()
 
 
 def _starting_basis(
@@ -544,14 +327,19 @@ def _checked_start(stamps: Array, **start: Array | None) -> dict[str, Array | No
     return start
 
 
-def _check_numbers(order: int, stamps: Array, *, scale: float, chunk_size: int | None) -> None:
-    """Refuse numbers that mean nothing."""
+def check_fit_order(order: int, stamps: Array) -> None:
+    """Refuse an order that no stamp of this shape can carry."""
     check_order(order)
     n_pixels = int(stamps.shape[1]) * int(stamps.shape[2])
     if n_coefficients(order) > n_pixels:
         raise FdntValueError(
             f"order {order} has {n_coefficients(order)} coefficients, and a stamp {n_pixels} pixels"
         )
+
+
+def _check_numbers(order: int, stamps: Array, *, scale: float, chunk_size: int | None) -> None:
+    """Refuse numbers that mean nothing."""
+    check_fit_order(order, stamps)
     if not (math.isfinite(scale) and scale > 0):
         raise RangeError("scale", scale, 0.0, None)
     if chunk_size is not None:
@@ -562,9 +350,3 @@ def _galaxies_at_once(order: int, stamps: Array) -> int:
     """Return how many galaxies fit the memory of a chunk."""
     n_coef, n_pixels = n_coefficients(order), int(stamps.shape[1]) * int(stamps.shape[2])
     return max(1, int(_BYTES_AT_ONCE / (8 * (3 * n_coef * n_pixels + 6 * n_coef**2))))
-
-
-def _times(matrix: Array, vector: Array) -> Array:
-    """Return `M v` of each galaxy."""
-    xp = array_namespace(matrix=matrix)
-    return xp.matmul(matrix, vector[:, :, None])[:, :, 0]

@@ -128,8 +128,15 @@ def prepare(
     )
 
 
-def screen(stamps: Array, psf: Psf) -> tuple[Array, Array]:
+def screen(stamps: Array, psf: Psf, present: Array | None = None) -> tuple[Array, Array]:
     """Return stamps that do no harm, zero where not finite, and why some cannot be measured.
+
+    Parameters
+    ----------
+    stamps : array, shape (n_gal, ny, nx)
+    psf : Psf
+    present : array, shape (n_gal, ny, nx), bool, optional
+        False where a pixel is missing: it is not looked at, and 0 in what is returned.
 
     Returns
     -------
@@ -138,22 +145,25 @@ def screen(stamps: Array, psf: Psf) -> tuple[Array, Array]:
         Zero, or a reason of `fdnt_xp.flags.Flag`.
     """
     xp = array_namespace(stamps=stamps)
-    finite = xp.all(xp.all(xp.isfinite(stamps), axis=-1), axis=-1)
-    stamps = xp.where(finite[:, None, None], stamps, xp.zeros_like(stamps))
-    brightest = xp.max(xp.max(stamps, axis=-1), axis=-1)
-    faintest = xp.min(xp.min(stamps, axis=-1), axis=-1)
+    present = xp.ones_like(stamps, dtype=xp.bool) if present is None else present
+    finite = xp.all(xp.all(xp.isfinite(stamps) | ~present, axis=-1), axis=-1)
+    present = present & finite[:, None, None]
+    stamps = xp.where(present, stamps, xp.zeros_like(stamps))
+    infinite = xp.full_like(stamps, float("inf"))
+    brightest = xp.max(xp.max(xp.where(present, stamps, -infinite), axis=-1), axis=-1)
+    faintest = xp.min(xp.min(xp.where(present, stamps, infinite), axis=-1), axis=-1)
     flags = xp.zeros_like(brightest, dtype=xp.int32)
     for reason, holds in (
         (Flag.NON_FINITE_PIXEL, ~finite),
-        (Flag.NO_SIGNAL, finite & (brightest == faintest)),
+        (Flag.NO_SIGNAL, finite & (brightest <= faintest)),
         (Flag.BAD_PSF, xp.broadcast_to(~psf.usable, finite.shape)),
     ):
         flags = flags + xp.astype(holds, xp.int32) * int(reason)
     return stamps, flags
 
 
-def galaxies_at_once(grid: KGrid, stamps: Array) -> int:
-    """Return how many galaxies fit the memory of a chunk."""
+def galaxies_at_once(grid: KGrid, stamps: Array, more: int = 0) -> int:
+    """Return how many galaxies fit the memory of a chunk, with `more` numbers for each."""
     ny, nx = stamps.shape[1:]
-    numbers = _FIELDS * grid.n_k + 3 * int(ny) * int(nx)
+    numbers = _FIELDS * grid.n_k + 3 * int(ny) * int(nx) + more
     return max(16, int(_BYTES_AT_ONCE / (numbers * 8)))

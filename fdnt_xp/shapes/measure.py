@@ -1,32 +1,28 @@
-"""The shape of every galaxy of a batch: FDNT-FT, from pixels to `ShapeResult`.
+"""The shape of every galaxy of a batch, from pixels to `ShapeResult`.
 
-stamps -> transform, divided by T        fourier
+pixels -> transform, divided by T        shapes.sources: of the stamps, or of fits to them
        -> centroid under a wide weight   shapes.centroid
        -> root of the five null tests    nulltests
        -> once more on a finer k grid for the few that need it
-       -> covariance, flux, flags
+       -> covariance, flux, flags        shapes.solution
 """
 
 from __future__ import annotations
 
-import math
-from types import ModuleType
-from typing import Final
+from dataclasses import replace
+from typing import Final, Literal, TypeAlias
 
-from fdnt_xp.arrays import (
-    Array,
-    array_namespace,
-    as_floating,
-    require_dtype,
-)
-from fdnt_xp.errors import RangeError, ShapeMismatchError
+from fdnt_xp.arrays import Array, array_namespace
+from fdnt_xp.errors import FdntValueError
 from fdnt_xp.flags import Flag
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.psf import Psf
-from fdnt_xp.fourier.transform import deconvolve
 from fdnt_xp.nulltests.dogleg import DoglegOptions, RootResult, find_root
 from fdnt_xp.nulltests.tests import NullTests
 from fdnt_xp.shapes.centroid import starting_centroid, wide_weight
+from fdnt_xp.shapes.fdnt_gl import fit_pixels_of
+from fdnt_xp.shapes.functionals import N_FUNCTIONALS
+from fdnt_xp.shapes.gl_fit import check_fit_order
 from fdnt_xp.shapes.job import (
     FINER,
     Job,
@@ -35,10 +31,22 @@ from fdnt_xp.shapes.job import (
     check_stamps,
     galaxies_at_once,
     prepare,
-    screen,
 )
+from fdnt_xp.shapes.laguerre import check_order, n_coefficients
+from fdnt_xp.shapes.pixels import Pixels, check_pixels
 from fdnt_xp.shapes.results import ShapeResult
-from fdnt_xp.shapes.solution import describe
+from fdnt_xp.shapes.solution import describe_with, solution_of
+from fdnt_xp.shapes.sources import (
+    FittedStamps,
+    Source,
+    UnevenStamps,
+    WhiteStamps,
+    filled_stamps,
+)
+
+Transform: TypeAlias = Literal["ft", "gl", "hybrid"]
+TRANSFORMS: Final = ("ft", "gl", "hybrid")
+"""Where the transform of a galaxy may come from; see `measure_shapes`."""
 
 _FINE_ABOVE: Final = 1.5
 """`|eta|` beyond which the weight, squeezed by `exp(-|eta|/2)`, covers few cells of the k grid."""
@@ -49,6 +57,9 @@ def measure_shapes(
     psf: Psf,
     *,
     noise_variance: float | Array | None = None,
+    ivar: Array | None = None,
+    transform: Transform = "ft",
+    order: int = 12,
     size: float | None = None,
     padding: int = 1,
     max_iter: int = 50,
@@ -67,8 +78,18 @@ def measure_shapes(
     psf : Psf
         One for all stamps, or one for each.
     noise_variance : float or array, shape (n_gal,), optional
-        Variance of the white noise of a pixel, (unit of the image)². Without it shapes
-        have no covariance and no S/N.
+        Variance of the white noise of a pixel, (unit of the image)². Without it, and
+        without `ivar`, shapes have no covariance and no S/N.
+    ivar : array, shape (n_gal, ny, nx), optional
+        In place of `noise_variance` the inverse variance of each pixel, 0 where it is
+        missing: what such a pixel holds, be it NaN, is not looked at.
+    transform : {"ft", "gl", "hybrid"}
+        Whose transform the tests are made of. "ft": that of the stamp; galaxies with
+        missing pixels are flagged `MASKED`. "gl": that of a Gauss-Laguerre fit to the
+        observed image, weighted by `ivar`. "hybrid": that of the stamp, with missing pixels
+        filled from such a fit, which is flagged `FILLED`.
+    order : int
+        Of the fits, 0 to 20: they have (order + 1)(order + 2)/2 coefficients.
     size : float, optional
         Fixes the size sigma of the Gaussian part of the weight, pixels, in the frame where
         the galaxy is round. By default it is matched to each galaxy.
@@ -84,17 +105,22 @@ def measure_shapes(
     Returns
     -------
     ShapeResult
-        Row i belongs to stamp i; an empty batch gives an empty result.
+        Row i belongs to stamp i; an empty batch gives an empty result. A galaxy with a
+        negative or infinite `ivar` or a NaN in it is flagged `NON_FINITE_PIXEL`, one whose
+        pixels do not carry a fit of the order `GL_FAILURE`, one without pixels `MASKED`.
 
     Raises
     ------
     FdntTypeError, NamespaceError
-        If `stamps` is no array or `psf` no `Psf`; if they, or `noise_variance`, are of two
-        libraries, dtypes or devices.
+        If `stamps` is no array or `psf` no `Psf`; if they, `noise_variance` or `ivar` are
+        of two libraries, dtypes or devices.
     ShapeMismatchError
-        If `stamps` has not three axes, or another number of rows than `psf` has PSFs.
+        If `stamps` has not three axes, or another number of rows than `psf` has PSFs, or
+        `ivar` another shape.
     FdntValueError, RangeError
-        If a number is out of range, or the PSF so wide that the stamps resolve nothing.
+        If a number is out of range, no stamp has as many pixels as the fit coefficients,
+        both `noise_variance` and `ivar` are given, there is no such transform, or the PSF
+        is so wide that the stamps resolve nothing.
 
     References
     ----------
@@ -113,28 +139,79 @@ def measure_shapes(
     """
     xp, stamps = check_stamps(stamps, psf)
     n_gal = int(stamps.shape[0])
-    noise = _noise_column(xp, noise_variance, stamps)
+    pixels = check_pixels(xp, stamps, noise_variance, ivar)
+    _check_transform(transform, order, stamps)
     check_options(size=size, padding=padding, chunk_size=chunk_size)
     check_count("max_iter", max_iter, 0)
     if n_gal == 0:
         return ShapeResult.unmeasured(stamps)
 
     job = prepare(xp, stamps, psf, padding, size, max_iter)
-    n_chunk = chunk_size or galaxies_at_once(job.coarse, stamps)
+    more = _more_numbers(job, pixels, transform, order)
+    n_chunk = chunk_size or galaxies_at_once(job.coarse, stamps, more)
     parts = []
     for start in range(0, n_gal, n_chunk):
         rows = slice(start, min(start + n_chunk, n_gal))
-        parts.append(_measure_chunk(job.rows(rows), stamps[rows, :, :], noise[rows]))
+        parts.append(_measure_chunk(job.rows(rows), pixels.rows(rows), transform, order))
     return ShapeResult.concat(parts)
 
 
-def _measure_chunk(job: Job, stamps: Array, noise: Array) -> ShapeResult:
-    """Measure on the coarse grid, then the few that need it on the fine one."""
-    xp = array_namespace(stamps=stamps)
-    stamps, flags = screen(stamps, job.psf)
-    measurable = flags == 0
+def _measure_chunk(job: Job, pixels: Pixels, transform: Transform, order: int) -> ShapeResult:
+    """Choose what the tests are made of, and measure."""
+    masked_fraction = pixels.masked_fraction()
+    pixels, flags = pixels.screened(job.psf)
+    if transform == "gl":
+        result = _measure_fits(job, pixels, flags, order)
+    elif pixels.ivar is None:
+        result = _measure_source(job, WhiteStamps(pixels=pixels), pixels, flags)
+    elif transform == "hybrid":
+        result = _measure_filled(job, pixels, flags, order)
+    else:
+        xp = array_namespace(flags=flags)
+        masked = (flags == 0) & (masked_fraction > 0)
+        flags = xp.where(masked, xp.full_like(flags, int(Flag.MASKED)), flags)
+        result = _measure_source(job, UnevenStamps(pixels=pixels), pixels, flags)
+    return replace(result, masked_fraction=masked_fraction)
 
-    result, finer = _measure_on(job, job.coarse, stamps, noise, flags)
+
+def _measure_fits(job: Job, pixels: Pixels, flags: Array, order: int) -> ShapeResult:
+    """Measure the transforms of Gauss-Laguerre fits."""
+    xp = array_namespace(flags=flags)
+    fit = fit_pixels_of(pixels, order)
+    flags = xp.where(flags == 0, fit.flags, flags)
+    source = FittedStamps(fit=fit.harmless(), variance=pixels.variance)
+    return _measure_source(job, source, pixels, flags)
+
+
+def _measure_filled(job: Job, pixels: Pixels, flags: Array, order: int) -> ShapeResult:
+    """Measure stamps, and fit and fill those with missing pixels before."""
+    xp = array_namespace(flags=flags)
+    masked = (flags == 0) & (pixels.masked_fraction() > 0)
+    # A host read: how many are to be fitted decides the size of that batch.
+    n_masked = int(xp.sum(xp.astype(masked, xp.int32)))
+    place = xp.argsort(xp.astype(~masked, xp.int32), stable=True)
+    parts = []
+    if n_masked > 0:
+        rows = place[:n_masked]
+        gappy = pixels.take(rows)
+        fit = fit_pixels_of(gappy, order)
+        source = filled_stamps(gappy, fit.harmless())
+        reasons = xp.where(fit.usable, xp.full_like(fit.flags, int(Flag.FILLED)), fit.flags)
+        parts.append(_measure_source(job.take(rows), source, gappy, reasons))
+    if n_masked < int(flags.shape[0]):
+        rows = place[n_masked:]
+        whole = pixels.take(rows)
+        reasons = xp.take(flags, rows, axis=0)
+        parts.append(_measure_source(job.take(rows), UnevenStamps(pixels=whole), whole, reasons))
+    return ShapeResult.concat(parts).take(xp.argsort(place))
+
+
+def _measure_source(job: Job, source: Source, pixels: Pixels, flags: Array) -> ShapeResult:
+    """Measure on the coarse grid, then the few that need it on the fine one."""
+    xp = array_namespace(flags=flags)
+    shape = pixels.stamp_shape
+    measurable = xp.bitwise_and(flags, xp.full_like(flags, ~int(Flag.FILLED))) == 0
+    result, finer = _measure_on(job, job.coarse, source, shape, flags)
     finer = finer & measurable
     # A host read: how many need the fine grid decides the size of that batch.
     n_fine = int(xp.sum(xp.astype(finer, xp.int32)))
@@ -142,42 +219,31 @@ def _measure_chunk(job: Job, stamps: Array, noise: Array) -> ShapeResult:
         return result
     order = xp.argsort(xp.astype(~finer, xp.int32), stable=True)
     parts = []
-    per_chunk = max(1, int(stamps.shape[0]) // FINER**2)
+    per_chunk = max(1, source.n_gal // FINER**2)
     for start in range(0, n_fine, per_chunk):
         rows = order[start : min(start + per_chunk, n_fine)]
-        again, _ = _measure_on(
-            job.take(rows),
-            job.fine,
-            xp.take(stamps, rows, axis=0),
-            xp.take(noise, rows, axis=0),
-            xp.take(flags, rows, axis=0) + int(Flag.FINE_GRID),
-        )
+        reasons = xp.take(flags, rows, axis=0) + int(Flag.FINE_GRID)
+        again, _ = _measure_on(job.take(rows), job.fine, source.take(rows), shape, reasons)
         parts.append(again)
     merged = ShapeResult.concat([*parts, result.take(order[n_fine:])])
     return merged.take(xp.argsort(order))
 
 
 def _measure_on(
-    job: Job, grid: KGrid, stamps: Array, noise: Array, flags: Array
+    job: Job, grid: KGrid, source: Source, stamp_shape: tuple[int, int], flags: Array
 ) -> tuple[ShapeResult, Array]:
     """Measure on one grid; return the shapes, and which a finer grid should measure again."""
-    xp = array_namespace(stamps=stamps)
+    xp = array_namespace(flags=flags)
     inverse_transfer = job.psf.inverse_transfer(grid)
-    galaxies = deconvolve(stamps, inverse_transfer, grid)
-    fixed = None if job.size is None else xp.full_like(noise, job.size**2)
+    galaxies = source.deconvolved(inverse_transfer, grid)
+    fixed = None if job.size is None else xp.full_like(galaxies.re[:, 0], job.size**2)
     tests = NullTests(
         grid=grid, galaxies=galaxies, weight=job.weight, length=job.length, fixed_width=fixed
     )
-    root = solve(job, tests, min(stamps.shape[1:]))
-    result = describe(
-        tests,
-        root,
-        inverse_power=xp.real(inverse_transfer) ** 2 + xp.imag(inverse_transfer) ** 2,
-        noise_per_mode=noise * float(grid.shape[0] * grid.shape[1]),
-        stamp_shape=(int(stamps.shape[1]), int(stamps.shape[2])),
-        flags=flags,
-    )
-    eta = root.x[:, :2]
+    root = solve(job, tests, min(stamp_shape))
+    eta, centroid = solution_of(tests, root)
+    noise = source.noise(tests, eta, centroid, inverse_transfer)
+    result = describe_with(tests, root, noise, stamp_shape=stamp_shape, flags=flags)
     elongated = eta[:, 0] ** 2 + eta[:, 1] ** 2 > _FINE_ABOVE**2
     return result, elongated | ~root.success
 
@@ -201,21 +267,27 @@ def solve(job: Job, tests: NullTests, side: int) -> RootResult:
     return find_root(tests, start, options=options)
 
 
-def _noise_column(xp: ModuleType, noise_variance: float | Array | None, stamps: Array) -> Array:
-    """Return the noise variance of each galaxy, NaN where unknown; shape (n_gal,)."""
-    like = stamps[:, 0, 0]
-    if noise_variance is None:
-        return xp.full_like(like, float("nan"))
-    if isinstance(noise_variance, int | float):
-        if not (math.isfinite(noise_variance) and noise_variance >= 0):
-            raise RangeError("noise_variance", float(noise_variance), 0.0, None)
-        return xp.full_like(like, float(noise_variance))
-    array_namespace(stamps=stamps, noise_variance=noise_variance)
-    noise = as_floating(xp, noise_variance, "noise_variance")
-    require_dtype(stamps.dtype, noise_variance=noise)
-    if noise.shape not in ((), like.shape):
-        raise ShapeMismatchError(
-            f"noise_variance must be a number or have the shape {tuple(like.shape)}, "
-            f"not {tuple(noise.shape)}"
-        )
-    return xp.broadcast_to(noise, like.shape)
+def _check_transform(transform: str, order: int, stamps: Array) -> None:
+    """Refuse a transform that there is not, and an order that the stamps cannot carry."""
+    if transform not in TRANSFORMS:
+        known = ", ".join(repr(name) for name in TRANSFORMS)
+        raise FdntValueError(f"no transform {transform!r}; known are {known}")
+    if transform == "ft":
+        check_order(order)
+    else:
+        check_fit_order(order, stamps)
+
+
+def _more_numbers(job: Job, pixels: Pixels, transform: Transform, order: int) -> int:
+    """Return how many numbers a galaxy takes beyond what its null tests take."""
+    ny, nx = pixels.stamp_shape
+    n_coef = n_coefficients(order)
+    more = 0
+    if transform != "ft":
+        more += 3 * n_coef**2
+    if transform == "gl":
+        more += (n_coef + 6 * N_FUNCTIONALS) * job.coarse.n_k
+    elif pixels.ivar is not None:
+        more += 8 * N_FUNCTIONALS * ny * nx + 6 * N_FUNCTIONALS * job.coarse.n_k
+        more += n_coef * ny * nx if transform == "hybrid" else 0
+    return more

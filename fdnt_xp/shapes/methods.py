@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Protocol
 
 from fdnt_xp.arrays import Array
@@ -27,7 +28,11 @@ class ShapeMethod(Protocol):
         """Measure the galaxy on each stamp."""
 
 
-SHAPE_METHODS: dict[str, ShapeMethod] = {"fdnt-ft": measure_shapes}
+SHAPE_METHODS: dict[str, ShapeMethod] = {
+    "fdnt-ft": measure_shapes,
+    "fdnt-gl": partial(measure_shapes, transform="gl"),
+    "fdnt-hybrid": partial(measure_shapes, transform="hybrid"),
+}
 """By name; `register_shape_method` adds to it."""
 
 

@@ -21,7 +21,8 @@ class ShapeResult:
     """Shapes of a batch of galaxies.
 
     All arrays share one library, dtype and device, that of the stamps; row i is galaxy i.
-    Where `flags` holds a bit of `fdnt_xp.flags.FAILED`, the float columns are NaN.
+    Where `flags` holds a bit of `fdnt_xp.flags.FAILED`, the float columns but
+    `masked_fraction` are NaN.
 
     Parameters
     ----------
@@ -46,6 +47,9 @@ class ShapeResult:
         Evaluations of the null tests.
     status : array, shape (n_gal,), int32
         Status of the solver, `fdnt_xp.nulltests.dogleg.Status`.
+    masked_fraction : array, shape (n_gal,), optional
+        Part of the stamp's pixels that is missing, of galaxies without a shape too. 0 if
+        not given.
     """
 
     eta: Array
@@ -58,6 +62,12 @@ class ShapeResult:
     flags: Array
     n_iter: Array
     status: Array
+    masked_fraction: Array = None
+
+    def __post_init__(self) -> None:
+        if self.masked_fraction is None:
+            xp = array_namespace(size=self.size)
+            object.__setattr__(self, "masked_fraction", xp.zeros_like(self.size))
 
     @classmethod
     def unmeasured(cls, stamps: Array) -> ShapeResult:
@@ -83,6 +93,7 @@ class ShapeResult:
             flags=code(int(Flag.NO_ATTEMPT)),
             n_iter=code(0),
             status=code(int(Status.RUNNING)),
+            masked_fraction=nan(),
         )
 
     @classmethod
@@ -153,6 +164,7 @@ class ShapeResult:
             "flags": host.flags,
             "n_iter": host.n_iter,
             "status": host.status,
+            "masked_fraction": host.masked_fraction,
         }
         table = Table(columns)
         for name, (unit, description) in COLUMNS.items():
@@ -180,5 +192,6 @@ COLUMNS: dict[str, tuple[str | None, str]] = {
     "flags": (None, "measurement flags, bits of fdnt_xp.flags.Flag"),
     "n_iter": (None, "evaluations of the null tests"),
     "status": (None, "status of the solver"),
+    "masked_fraction": (None, "part of the stamp's pixels that is missing"),
 }
 """Unit and description of every column of `ShapeResult.to_table`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final
 
 from fdnt_xp.arrays import Array, array_namespace, device_of
@@ -22,12 +23,88 @@ _STATUS_FLAGS: Final = {
 }
 
 
+@dataclass(frozen=True, kw_only=True)
+class SolutionNoise:
+    """The noise of the tests and of the flux at a solution.
+
+    Parameters
+    ----------
+    tests : TestNoise
+        For its flux, its tests and its weight; its own covariances are not looked at.
+    covariance : array, shape (n_gal, 4, 4)
+        Of (t1, t2, tx, ty), the noise of the size of the weight included; NaN if unknown.
+    flux_variance : array, shape (n_gal,)
+    """
+
+    tests: TestNoise
+    covariance: Array
+    flux_variance: Array
+
+    @classmethod
+    def of(cls, tests: TestNoise, covariance: Array) -> SolutionNoise:
+        """Make it of the covariance of (t1, t2, tx, ty, flux), shape (n_gal, 5, 5)."""
+        return cls(
+            tests=tests,
+            covariance=covariance[:, :4, :4],
+            flux_variance=covariance[:, 4, 4],
+        )
+
+
+def white_noise(tests: TestNoise, noise_per_mode: Array) -> SolutionNoise:
+    """Return the noise of the tests where that of the image is white.
+
+    Even and odd tests then have none in common.
+
+    Parameters
+    ----------
+    noise_per_mode : array, shape (n_gal,)
+        `n N`: variance of a pixel times the number of pixels of the grid; NaN if unknown.
+    """
+    xp = array_namespace(even=tests.even)
+    zero = xp.zeros_like(tests.even)
+    rows = [xp.concat([tests.even, zero], axis=-1), xp.concat([zero, tests.odd], axis=-1)]
+    return SolutionNoise(
+        tests=tests,
+        covariance=xp.concat(rows, axis=-2) * noise_per_mode[:, None, None],
+        flux_variance=tests.flux_variance * noise_per_mode,
+    )
+
+
 def describe(
     tests: NullTests,
     root: RootResult,
     *,
     inverse_power: Array,
     noise_per_mode: Array,
+    stamp_shape: tuple[int, int],
+    flags: Array,
+) -> ShapeResult:
+    """Return the shapes at the roots of the tests of images with white noise.
+
+    Parameters
+    ----------
+    tests, root, stamp_shape, flags
+        As `describe_with` has them.
+    inverse_power : array, shape (n_gal or 1, n_k)
+        `1/|T|²` inside the disc.
+    noise_per_mode : array, shape (n_gal,)
+        As `white_noise` has it.
+    """
+    eta, centroid = solution_of(tests, root)
+    noise = white_noise(tests.noise(eta, centroid, inverse_power), noise_per_mode)
+    return describe_with(tests, root, noise, stamp_shape=stamp_shape, flags=flags)
+
+
+def solution_of(tests: NullTests, root: RootResult) -> tuple[Array, Array]:
+    """Return eta and the centroid, pixels from the centre of the stamp, at the roots."""
+    return root.x[:, :2], tests.length * root.x[:, 2:]
+
+
+def describe_with(
+    tests: NullTests,
+    root: RootResult,
+    noise: SolutionNoise,
+    *,
     stamp_shape: tuple[int, int],
     flags: Array,
 ) -> ShapeResult:
@@ -39,20 +116,18 @@ def describe(
         Those that were solved.
     root : RootResult
         In `(eta1, eta2, x0/L, y0/L)`.
-    inverse_power : array, shape (n_gal or 1, n_k)
-        `1/|T|²` inside the disc.
-    noise_per_mode : array, shape (n_gal,)
-        `n N`: variance of a pixel times the number of pixels of the grid; NaN if unknown.
+    noise : SolutionNoise
+        At the roots.
     stamp_shape : tuple of int
         (ny, nx).
     flags : array, shape (n_gal,), int32
         What is known of each galaxy so far.
     """
     xp = array_namespace(x=root.x)
-    eta, centroid = root.x[:, :2], tests.length * root.x[:, 2:]
-    noise = tests.noise(eta, centroid, inverse_power)
+    eta, centroid = solution_of(tests, root)
     eta_cov, regular = _eta_covariance(tests, root, noise)
-    flux, variance = noise.flux, noise.flux_variance * noise_per_mode
+    matched = noise.tests.matched
+    flux, variance = noise.tests.flux, noise.flux_variance
     known = variance > 0
     snr = flux / xp.sqrt(xp.where(known, variance, xp.ones_like(variance)))
     snr = xp.where(known, snr, xp.full_like(snr, float("nan")))
@@ -68,12 +143,12 @@ def describe(
         (Flag.TOO_ELLIPTICAL, root.success & too_elliptical),
         (Flag.NO_SIGNAL, root.success & ~(flux > 0)),
     ]
-    clear = flags == xp.bitwise_and(flags, xp.full_like(flags, int(Flag.FINE_GRID)))
+    clear = flags == xp.bitwise_and(flags, xp.full_like(flags, int(Flag.FINE_GRID | Flag.FILLED)))
     for flag, holds in reasons:
         flags = _raised(flags, flag, clear & holds)
     measured = xp.bitwise_and(flags, xp.full_like(flags, int(FAILED))) == 0
     information = Flag.SIZE_AT_BOUND if tests.fixed_width is None else Flag.SIZE_FIXED
-    informed = noise.matched.at_bound if tests.fixed_width is None else measured
+    informed = matched.at_bound if tests.fixed_width is None else measured
     flags = _raised(flags, information, measured & informed)
     middle = (xp.full_like(flux, 0.5 * (nx - 1)), xp.full_like(flux, 0.5 * (ny - 1)))
 
@@ -84,10 +159,10 @@ def describe(
 
     return ShapeResult(
         eta=where_measured(eta),
-        eg=where_measured(ellipticity_gradient(eta, noise.tests, noise.matched, tests.length)),
-        eta_cov=where_measured(eta_cov * noise_per_mode[:, None, None]),
+        eg=where_measured(ellipticity_gradient(eta, noise.tests.tests, matched, tests.length)),
+        eta_cov=where_measured(eta_cov),
         centroid=where_measured(centroid + xp.stack(middle, axis=-1)),
-        size=where_measured(xp.sqrt(noise.matched.width)),
+        size=where_measured(xp.sqrt(matched.width)),
         flux=where_measured(flux),
         snr=where_measured(snr),
         flags=flags,
@@ -96,11 +171,13 @@ def describe(
     )
 
 
-def _eta_covariance(tests: NullTests, root: RootResult, noise: TestNoise) -> tuple[Array, Array]:
-    """Return `J⁻¹ Cov(f) J⁻ᵀ` of eta for unit noise per mode, and where J is regular.
+def _eta_covariance(
+    tests: NullTests, root: RootResult, noise: SolutionNoise
+) -> tuple[Array, Array]:
+    """Return `J⁻¹ Cov(f) J⁻ᵀ` of eta, and where J is regular.
 
     The scaled tests are `(t1, t2, tx/L, ty/L)/t0`, and t vanishes at the root: the noise of
-    t0 does not matter. Even and odd tests have no common noise.
+    t0 does not matter.
     """
     xp = array_namespace(x=root.x)
     inverse, regular = [], root.success
@@ -112,15 +189,14 @@ def _eta_covariance(tests: NullTests, root: RootResult, noise: TestNoise) -> tup
         regular = regular & solved
     # Rows 0 and 1 of J⁻¹, column by column.
     to_eta = xp.stack(inverse, axis=-1)[:, :2, :]
-    scale = noise.tests.values[:, 4]
+    scale = noise.tests.tests.values[:, 4]
     safe = xp.where(scale > 0, scale, xp.ones_like(scale))[:, None, None]
-    even = to_eta[:, :, :2] / safe
-    odd = to_eta[:, :, 2:] / (safe * tests.length)
-    return _sandwich(even, noise.even) + _sandwich(odd, noise.odd), regular
+    to_eta = xp.concat([to_eta[:, :, :2], to_eta[:, :, 2:] / tests.length], axis=-1) / safe
+    return _sandwich(to_eta, noise.covariance), regular
 
 
 def _sandwich(a: Array, c: Array) -> Array:
-    """Return `A C Aᵀ` for stacks of 2 by 2 matrices, as sums of products."""
+    """Return `A C Aᵀ` for stacks of small matrices, as sums of products."""
     xp = array_namespace(a=a)
     ac = xp.sum(a[:, :, :, None] * c[:, None, :, :], axis=2)
     return xp.sum(ac[:, :, None, :] * a[:, None, :, :], axis=-1)

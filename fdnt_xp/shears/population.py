@@ -273,8 +273,10 @@ class _Null:
         if self.sample.noise is None and not self.selection.hard:
             return least
         error = min(_pair(ratio_errors(v.values, response)[0]))
-        share = _TOLERANCE_HARD if self.selection.hard else _TOLERANCE_NOISY
-        return max(least, share * error)
+        if self.selection.hard:
+            # A step of the mean is one galaxy, and moves the null by an error over sqrt(n).
+            return max(least, (_TOLERANCE_HARD + 1.0 / math.sqrt(v.counted)) * error)
+        return max(least, _TOLERANCE_NOISY * error)
 
     def _by_noise_power(self, gamma: Gamma, v: _Weighed, response: Array) -> Array:
         """Return by how much gamma moves for a relative change of the noise power by 1."""

@@ -1,0 +1,289 @@
+"""NB07: Gauss-Laguerre functions fitted to the galaxy before the PSF, through the PSF.
+
+Nakajima and Bernstein (2007; B10 §2.1): the functions of a trial centre, shape and size are
+convolved with the PSF and fitted to the pixels; the centre, shape and size are those at which
+`b10 = b20 = b11 = 0`. The convolved functions are `psi~(k) T(k)`, transformed back to pixels:
+their transforms are known, and a fit of pixels needs nothing to be known beyond the stamp.
+
+The functions of high order differ by what the PSF hardly lets pass, and the normal equations
+lose digits with them: all is computed in float64, whatever the precision of the stamps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdnt_xp.arrays import Array, array_namespace, device_of
+from fdnt_xp.fourier.psf import Psf
+from fdnt_xp.nulltests.dogleg import DoglegOptions, find_root, newton_step
+from fdnt_xp.nulltests.tests import inverse_if_positive
+from fdnt_xp.peers.batch import Fitted, in_domain, measure_in_chunks, shapes_of
+from fdnt_xp.peers.circular import CIRCULAR_METHODS, ImageFit
+from fdnt_xp.peers.drawing import Drawing
+from fdnt_xp.peers.levenberg import find_minimum
+from fdnt_xp.shapes.least_squares import LinearFit, least_squares
+from fdnt_xp.shapes.laguerre import (
+    MAX_ORDER,
+    LaguerreBasis,
+    degrees,
+    generators,
+    n_coefficients,
+    position,
+)
+from fdnt_xp.shapes.results import ShapeResult
+
+FINER: Final = 2
+"""The k grid of the functions is this much finer than the stamps'."""
+LARGEST_INFLATION: Final = 1e11
+"""Inflation of a variance beyond which rounding would decide over the fit."""
+_FTOL: Final = 1e-9
+_TESTS: Final = (
+    position(1, 0),
+    position(1, 0, sine=True),
+    position(2, 0),
+    position(2, 0, sine=True),
+    position(1, 1),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Nb07Method:
+    """The method of one order; called as `measure_shapes` is.
+
+    `size` of the result, and the one that may be fixed, is sigma of the basis before the PSF;
+    `flux` is that of its Gaussian, b00, and `snr` that over its error at fixed basis with all
+    coefficients free. There is no ellipticity gradient: `eg` is 0.
+
+    Parameters
+    ----------
+    order : int
+        Largest p + q, 2 to 18.
+    max_iter : int
+        Steps of the root finder.
+    """
+
+    order: int
+    max_iter: int = 60
+
+    def __call__(
+        self,
+        stamps: Array,
+        psf: Psf,
+        *,
+        noise_variance: float | Array | None = None,
+        size: float | None = None,
+        padding: int = 1,
+        chunk_size: int | None = None,
+    ) -> ShapeResult:
+        """Measure the galaxy on each stamp; see `measure_shapes` for the arguments."""
+        shape = (int(stamps.shape[-2]), int(stamps.shape[-1])) if stamps.ndim == 3 else (1, 1)
+        n_modes = (FINER * padding) ** 2 * shape[0] * shape[1]
+
+        def measure(stamps: Array, psf: Psf, noise: Array, flags: Array) -> ShapeResult:
+            xp = array_namespace(stamps=stamps)
+            drawing = Drawing.through(xp, psf, shape, FINER * padding, xp.float64)
+            wide = xp.astype(stamps, xp.float64)
+            fit = self._fit(drawing, wide, size)
+            shapes = shapes_of(
+                fit,
+                xp.astype(noise, xp.float64),
+                flags,
+                stamp_shape=shape,
+                fixed=size is not None,
+            )
+            return _in_precision(shapes, stamps)
+
+        return measure_in_chunks(
+            measure,
+            stamps,
+            psf,
+            noise_variance=noise_variance,
+            size=size,
+            padding=padding,
+            chunk_size=chunk_size,
+            numbers_a_galaxy=3 * n_coefficients(self.order + 2) * n_modes,
+        )
+
+    def _fit(self, drawing: Drawing, stamps: Array, size: float | None) -> Fitted:
+        """Start from the Gaussian of the greatest likelihood, and solve the null tests."""
+        xp = array_namespace(stamps=stamps)
+        gaussian = CIRCULAR_METHODS["gauss-1"]
+        first = ImageFit.of(drawing, gaussian.profile, stamps, size=size)
+        at = find_minimum(first, first.start(gaussian.start), max_iter=gaussian.max_iter)
+        tests = ConvolvedTests(
+            drawing=drawing,
+            order=self.order,
+            pixels=first.pixels,
+            length=first.length,
+            fixed_size=size,
+        )
+        options = DoglegOptions(ftol=_FTOL, max_iter=self.max_iter, max_radius=1.0)
+        options = replace(options, initial_radius=0.5)
+        root = find_root(tests, at.x, options=options)
+        eta, centroid, sigma = tests.parameters(root.x)
+        fit, jac, _ = tests.solved(root.x)
+        b00 = fit.coefficients[:, 0]
+        to_flux = first.norm * sigma * (2.0 * np.pi**0.5)
+        covariance, regular = _covariance(root.jac, fit, b00, fixed=size is not None)
+        del jac
+        return Fitted(
+            eta=eta,
+            eta_cov=covariance / (first.norm**2)[:, None, None],
+            centroid=centroid,
+            size=sigma,
+            flux=b00 * to_flux,
+            flux_variance=fit.covariance[:, 0, 0] * (to_flux / first.norm) ** 2,
+            regular=regular & (fit.inflation < LARGEST_INFLATION),
+            status=root.status,
+            n_eval=root.n_eval + at.n_eval,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConvolvedTests:
+    """`b10`, `b20` and `b11` over `b00`: a `RootProblem` in `(x0/L, y0/L, eta1, eta2, ln sigma)`.
+
+    Parameters
+    ----------
+    drawing : Drawing
+    order : int
+    pixels : array, shape (n_gal, n_pix)
+        The sum of their squares is 1.
+    length : array, shape (n_gal,)
+        L, pixels.
+    fixed_size : float or None
+        sigma, if it is not free: the last test is then ln sigma itself.
+    """
+
+    drawing: Drawing
+    order: int
+    pixels: Array
+    length: Array
+    fixed_size: float | None
+
+    def take(self, rows: Array) -> ConvolvedTests:
+        """Return the tests of the given galaxies (integer array)."""
+        xp = array_namespace(rows=rows)
+        return replace(
+            self,
+            drawing=self.drawing.take(rows),
+            pixels=xp.take(self.pixels, rows, axis=0),
+            length=xp.take(self.length, rows, axis=0),
+        )
+
+    def parameters(self, x: Array) -> tuple[Array, Array, Array]:
+        """Return shape, centroid in pixels from the stamp's centre, and size."""
+        xp = array_namespace(x=x)
+        return x[:, 2:4], self.length[:, None] * x[:, :2], xp.exp(x[:, 4])
+
+    def evaluate(self, x: Array) -> tuple[Array, Array]:
+        """Return the tests, shape (n_gal, 5), and their Jacobian, (n_gal, 5, 5)."""
+        xp = array_namespace(x=x)
+        fit, slopes, sane = self.solved(x)
+        b00 = fit.coefficients[:, 0]
+        sane = sane & (fit.inflation < LARGEST_INFLATION)
+        inverse = inverse_if_positive(xp.where(sane, b00, -xp.ones_like(b00)))[:, None]
+        f = xp.stack([fit.coefficients[:, j] for j in _TESTS], axis=-1) * inverse
+        by_test = xp.stack([slopes[:, :, j] for j in _TESTS], axis=-1)
+        jac = (by_test - slopes[:, :, :1] * f[:, None, :]) * inverse[:, :, None]
+        jac = xp.matrix_transpose(jac)
+        if self.fixed_size is None:
+            return f, jac
+        last = x[:, 4:] - float(np.log(self.fixed_size))
+        pinned = xp.concat([xp.zeros_like(f[:, :4]), xp.ones_like(last)], axis=-1)
+        return (
+            xp.concat([f[:, :4], last], axis=-1),
+            xp.concat([jac[:, :4, :], pinned[:, None, :]], axis=1),
+        )
+
+    def solved(self, x: Array) -> tuple[LinearFit, Array, Array]:
+        """Return the fit, what the unknowns do to its coefficients, and where the basis is sane.
+
+        Moving the basis changes an image by the generators, up to two orders higher; what the
+        fit makes of that change is the slope, shape (n_gal, 5, n_coef). It leaves out that the
+        functions move against the residual too.
+        """
+        xp = array_namespace(x=x)
+        basis, sane = self._basis(x)
+        drawn = self._drawn(basis)
+        n = n_coefficients(self.order)
+        functions = drawn[:, :n, :]
+        fit = least_squares(functions, self.pixels, xp.ones_like(self.pixels))
+        like = {"dtype": x.dtype, "device": device_of(x)}
+        matrix = xp.asarray(_generators_of(self.order), **like)
+        n_wide = int(drawn.shape[1])
+        moved = xp.reshape(xp.matmul(fit.coefficients, matrix), (-1, 6, n_wide))
+        changes = xp.matmul(basis.moves(self.length), moved)
+        images = xp.matmul(changes, drawn)
+        right = xp.matmul(images, xp.matrix_transpose(functions))
+        return fit, xp.matmul(right, fit.covariance), sane
+
+    def _basis(self, x: Array) -> tuple[LaguerreBasis, Array]:
+        """Return a basis two orders higher, a unit circle where absurd, and where it is not."""
+        xp = array_namespace(x=x)
+        eta, centroid, size = self.parameters(x)
+        sane = in_domain(eta, centroid, size, min(self.drawing.stamp_shape))
+        basis = LaguerreBasis(
+            order=self.order + 2,
+            eta=xp.where(sane[:, None], eta, xp.zeros_like(eta)),
+            centroid=xp.where(sane[:, None], centroid, xp.zeros_like(centroid)),
+            size=xp.where(sane, size, xp.ones_like(size)),
+        )
+        return basis, sane
+
+    def _drawn(self, basis: LaguerreBasis) -> Array:
+        """Return the functions as they are seen, shape (n_gal, n_coef, n_pix)."""
+        xp = array_namespace(eta=basis.eta)
+        seen = self.drawing.transfer * self.drawing.phase(basis.centroid)
+        functions = basis.in_k(self.drawing.kx, self.drawing.ky)
+        powers = xp.asarray(
+            (-1j) ** np.array(degrees(basis.order)), dtype=seen.dtype, device=device_of(seen)
+        )
+        return self.drawing.images(functions * seen[:, None, :] * powers[None, :, None])
+
+
+def _covariance(jac: Array, fit: LinearFit, b00: Array, *, fixed: bool) -> tuple[Array, Array]:
+    """Return `J⁻¹ Cov(t) J⁻ᵀ` of eta, and where J is regular.
+
+    The tests vanish at the root: the noise of b00 does not matter.
+    """
+    xp = array_namespace(jac=jac)
+    n_tests = 4 if fixed else 5
+    unit = xp.eye(5, dtype=jac.dtype, device=device_of(jac))
+    columns, regular = [], b00 > 0
+    for j in range(n_tests):
+        column, solved = newton_step(xp, -xp.broadcast_to(unit[j, :], jac.shape[:2]), jac)
+        columns.append(column[:, 2:4])
+        regular = regular & solved
+    to_eta = xp.stack(columns, axis=-1)
+    rows = [
+        xp.stack([fit.covariance[:, i, j] for j in _TESTS[:n_tests]], axis=-1)
+        for i in _TESTS[:n_tests]
+    ]
+    square = xp.where(b00 > 0, b00, xp.ones_like(b00)) ** 2
+    tests = xp.stack(rows, axis=1) / square[:, None, None]
+    return xp.matmul(xp.matmul(to_eta, tests), xp.matrix_transpose(to_eta)), regular
+
+
+@lru_cache
+def _generators_of(order: int) -> NDArray[np.float64]:
+    """Return (n_coef, 6 n_wide): coefficients of the order, by what they become two higher."""
+    whole = generators(order + 2)[:, :, : n_coefficients(order)]
+    return np.ascontiguousarray(np.reshape(whole, (-1, whole.shape[-1])).T)
+
+
+def _in_precision(shapes: ShapeResult, stamps: Array) -> ShapeResult:
+    """Return the result in the precision of the stamps."""
+    xp = array_namespace(stamps=stamps)
+    names = ("eta", "eta_cov", "eg", "centroid", "size", "flux", "snr")
+    return replace(shapes, **{n: xp.astype(getattr(shapes, n), stamps.dtype) for n in names})
+
+
+NB07_METHODS: Final = {f"nb07-{n}": Nb07Method(order=n) for n in (8, 12)}
+"""By the names they are registered by; "nb07" is the first."""
+assert max(method.order for method in NB07_METHODS.values()) <= MAX_ORDER - 2

@@ -1,0 +1,124 @@
+"""The stamps of a call, what is known of their noise, and which pixels are missing."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from types import ModuleType
+
+from fdnt_xp.arrays import Array, array_namespace, as_floating, require_dtype
+from fdnt_xp.errors import FdntValueError, RangeError, ShapeMismatchError
+from fdnt_xp.flags import Flag
+from fdnt_xp.fourier.psf import Psf
+from fdnt_xp.shapes.job import screen
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pixels:
+    """Stamps with white noise, or with an inverse variance for each pixel.
+
+    Parameters
+    ----------
+    stamps : array, shape (n_gal, ny, nx)
+    variance : array, shape (n_gal,)
+        Of the noise of a pixel; NaN where unknown. 1 where there is an `ivar`.
+    ivar : array, shape (n_gal, ny, nx), optional
+        0 where a pixel is missing.
+    """
+
+    stamps: Array
+    variance: Array
+    ivar: Array | None = None
+
+    @property
+    def stamp_shape(self) -> tuple[int, int]:
+        """(ny, nx)."""
+        return int(self.stamps.shape[1]), int(self.stamps.shape[2])
+
+    def rows(self, rows: slice) -> Pixels:
+        """Return a range of galaxies."""
+        return Pixels(
+            stamps=self.stamps[rows, :, :],
+            variance=self.variance[rows],
+            ivar=None if self.ivar is None else self.ivar[rows, :, :],
+        )
+
+    def take(self, rows: Array) -> Pixels:
+        """Return the given galaxies (integer array)."""
+        xp = array_namespace(rows=rows)
+        return Pixels(
+            stamps=xp.take(self.stamps, rows, axis=0),
+            variance=xp.take(self.variance, rows, axis=0),
+            ivar=None if self.ivar is None else xp.take(self.ivar, rows, axis=0),
+        )
+
+    def masked_fraction(self) -> Array:
+        """Return the part of the pixels that is missing, shape (n_gal,)."""
+        xp = array_namespace(stamps=self.stamps)
+        if self.ivar is None:
+            return xp.zeros_like(self.stamps[:, 0, 0])
+        missing = xp.astype(~(self.ivar > 0), self.stamps.dtype)
+        return xp.mean(xp.mean(missing, axis=-1), axis=-1)
+
+    def screened(self, psf: Psf) -> tuple[Pixels, Array]:
+        """Return pixels that do no harm, 0 where missing, and why some cannot be measured.
+
+        Returns
+        -------
+        pixels : Pixels
+            With `ivar >= 0` and finite.
+        flags : array, shape (n_gal,), int32
+        """
+        if self.ivar is None:
+            stamps, flags = screen(self.stamps, psf)
+            return Pixels(stamps=stamps, variance=self.variance), flags
+        xp = array_namespace(stamps=self.stamps)
+        fair = xp.all(xp.all(xp.isfinite(self.ivar) & (self.ivar >= 0), axis=-1), axis=-1)
+        present = (self.ivar > 0) & fair[:, None, None]
+        ivar = xp.where(present, self.ivar, xp.zeros_like(self.ivar))
+        stamps, flags = screen(self.stamps, psf, present)
+        none = fair & ~xp.any(xp.any(present, axis=-1), axis=-1)
+        for reason, holds in ((Flag.MASKED, none), (Flag.NON_FINITE_PIXEL, ~fair)):
+            flags = xp.where(holds, xp.full_like(flags, int(reason)), flags)
+        return Pixels(stamps=stamps, variance=self.variance, ivar=ivar), flags
+
+
+def check_pixels(
+    xp: ModuleType, stamps: Array, noise_variance: float | Array | None, ivar: Array | None
+) -> Pixels:
+    """Refuse noise that does not fit the stamps."""
+    if ivar is None:
+        return Pixels(stamps=stamps, variance=noise_column(xp, noise_variance, stamps))
+    if noise_variance is not None:
+        raise FdntValueError(
+            "noise_variance and ivar cannot both be given: ivar is 1/variance, pixel by pixel"
+        )
+    array_namespace(stamps=stamps, ivar=ivar)
+    ivar = as_floating(xp, ivar, "ivar")
+    require_dtype(stamps.dtype, ivar=ivar)
+    if ivar.shape != stamps.shape:
+        raise ShapeMismatchError(
+            f"ivar must have the shape of the stamps, {tuple(stamps.shape)}, not "
+            f"{tuple(ivar.shape)}"
+        )
+    return Pixels(stamps=stamps, variance=xp.ones_like(stamps[:, 0, 0]), ivar=ivar)
+
+
+def noise_column(xp: ModuleType, noise_variance: float | Array | None, stamps: Array) -> Array:
+    """Return the noise variance of each galaxy, NaN where unknown; shape (n_gal,)."""
+    like = stamps[:, 0, 0]
+    if noise_variance is None:
+        return xp.full_like(like, float("nan"))
+    if isinstance(noise_variance, int | float):
+        if not (math.isfinite(noise_variance) and noise_variance >= 0):
+            raise RangeError("noise_variance", float(noise_variance), 0.0, None)
+        return xp.full_like(like, float(noise_variance))
+    array_namespace(stamps=stamps, noise_variance=noise_variance)
+    noise = as_floating(xp, noise_variance, "noise_variance")
+    require_dtype(stamps.dtype, noise_variance=noise)
+    if noise.shape not in ((), like.shape):
+        raise ShapeMismatchError(
+            f"noise_variance must be a number or have the shape {tuple(like.shape)}, "
+            f"not {tuple(noise.shape)}"
+        )
+    return xp.broadcast_to(noise, like.shape)
