@@ -23,8 +23,8 @@ import numpy as np
 from scipy import ndimage
 
 from fdnt_xp.app.ring import write_json
-from fdnt_xp.data.noise_bias import Population, draw_versions
 from fdnt_xp.data.noise_control import KnownNoise, second_order
+from fdnt_xp.data.versions import Population, draw_versions
 from fdnt_xp.fourier.missing import fill_missing
 from fdnt_xp.fourier.psf import Psf
 from fdnt_xp.shapes.gl_fit import filled, fit_laguerre

@@ -12,9 +12,9 @@ import math
 
 import numpy as np
 import pytest
-from conftest import CELL, N_GAL
 
 import fdnt_xp as fx
+from conftest import CELL, N_GAL
 from fdnt_xp.data.simulate import NOISE_SIGMA
 
 SNR = 15.0

@@ -15,16 +15,10 @@ from click.testing import CliRunner
 import fdnt_xp as fx
 from fdnt_xp.app.check import STYLES, parse_radius, plot_biases
 from fdnt_xp.app.cli import main
-from fdnt_xp.data.noise_bias import (
-    ESTIMATORS,
-    SYMMETRIES,
-    Estimator,
-    NoiseBias,
-    Population,
-    draw_versions,
-    noise_bias,
-)
+from fdnt_xp.data.noise_bias import SYMMETRIES, NoiseBias, noise_bias
+from fdnt_xp.data.noise_estimators import ESTIMATORS, Estimator
 from fdnt_xp.data.other_codes import Found, NoisyStamps, fpfs_shear, turn_quarter
+from fdnt_xp.data.versions import Population, draw_versions
 from fdnt_xp.errors import FdntValueError, MissingExtraError, RangeError
 
 pytest.importorskip("galsim")

@@ -21,15 +21,9 @@ from fdnt_xp.app.plots import (
     save_figure,
 )
 from fdnt_xp.app.ring import TARGET, check_json, write_json
-from fdnt_xp.data.noise_bias import (
-    MIXED_RADII,
-    NoiseBias,
-    Population,
-    check_estimators,
-    check_snr,
-    draw_versions,
-    noise_bias,
-)
+from fdnt_xp.data.noise_bias import NoiseBias, check_snr, noise_bias
+from fdnt_xp.data.noise_estimators import check_estimators
+from fdnt_xp.data.versions import MIXED_RADII, Population, draw_versions
 from fdnt_xp.errors import FdntValueError
 
 if TYPE_CHECKING:

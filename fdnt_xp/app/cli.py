@@ -23,7 +23,8 @@ from fdnt_xp.app.ring import RingOptions, run_ring
 from fdnt_xp.app.shear import catalog_shear, report_lines
 from fdnt_xp.app.summary import summary_lines
 from fdnt_xp.data.catalog import check_catalog, read_catalog, write_catalog
-from fdnt_xp.data.noise_bias import ESTIMATORS, KINDS
+from fdnt_xp.data.noise_estimators import ESTIMATORS
+from fdnt_xp.data.versions import KINDS
 from fdnt_xp.errors import FdntError, FdntWarning
 
 _F = TypeVar("_F", bound=Callable[..., Any])

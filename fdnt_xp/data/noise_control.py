@@ -47,7 +47,7 @@ class KnownNoise:
     identifiers, symmetry : array of int64, shape (n_gal,)
     seed : int
         Of the synthetic noise, as `population_null` is told.
-    softening, max_shear : float
+    softening, max_shear, padding
         Of `population_null`; for `measure_responses` its step is the reach.
     """
 
@@ -60,6 +60,7 @@ class KnownNoise:
     seed: int
     softening: float = 1.0
     max_shear: float = 0.1
+    padding: int = 1
 
 
 def second_order(known: KnownNoise, gamma: Gamma) -> Real:
@@ -79,7 +80,7 @@ def second_order(known: KnownNoise, gamma: Gamma) -> Real:
         size=None,
         softening=known.softening,
         max_shear=known.max_shear,
-        padding=1,
+        padding=known.padding,
         chunk_size=None,
         noise=NoiseOptions(
             noise_variance=known.variance,

@@ -33,8 +33,10 @@ class NoisyStamps:
 
     Parameters
     ----------
-    pixels : array, shape (n, ny, nx)
-        Square.
+    pixels, clean : array, shape (n, ny, nx)
+        Square; with noise, and without.
+    shear : float
+        Reduced shear along x that was put on.
     identifiers, symmetry : array of integers, shape (n,)
         Of `population_null`; those of all versions of a galaxy are the same.
     psf_of : array of integers, shape (n,)
@@ -50,6 +52,8 @@ class NoisyStamps:
     """
 
     pixels: NDArray[np.float64]
+    clean: NDArray[np.float64]
+    shear: float
     identifiers: NDArray[np.int64]
     symmetry: NDArray[np.int64]
     psf_of: NDArray[np.int64]
@@ -60,7 +64,7 @@ class NoisyStamps:
 
     def take(self, rows: NDArray[np.int64]) -> NoisyStamps:
         """Return the stamps of the given rows."""
-        names = ("pixels", "identifiers", "symmetry", "psf_of", "offsets")
+        names = ("pixels", "clean", "identifiers", "symmetry", "psf_of", "offsets")
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from fdnt_xp.data.noise_bias import Population, draw_versions, noise_bias
+from fdnt_xp.data.noise_bias import noise_bias
+from fdnt_xp.data.versions import Population, draw_versions
 
 SIGNIFICANT = 4.0
 
