@@ -229,9 +229,11 @@ def test_a_variance_for_each_galaxy_and_a_white_spectrum_are_the_same():
     each = fx.population_null(stamps, psf, noise_variance=np.full(64, variance))
     np.testing.assert_array_equal(each.g, number.g)
     spectrum = np.full((48, 48), variance)
+    psfs = fx.Psf.from_image(np.stack([star()] * 64))
     for power in (spectrum, np.stack([spectrum] * 64)):
-        white = fx.population_null(stamps, psf, noise_power=power, chunk_size=30)
-        np.testing.assert_allclose(white.g, number.g, atol=1e-9)
+        for stars in (psf, psfs):
+            white = fx.population_null(stamps, stars, noise_power=power, chunk_size=30)
+            np.testing.assert_allclose(white.g, number.g, atol=1e-9)
 
 
 def test_a_large_sample_begins_with_a_part_of_it(monkeypatch):

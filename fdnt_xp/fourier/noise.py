@@ -24,20 +24,23 @@ from fdnt_xp.arrays import Array, array_namespace, device_of
 from fdnt_xp.fourier.deviates import unit_deviates
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.interpolation import cubic_table
-from fdnt_xp.fourier.psf import Psf, power_on_circles, transform_on_modes
+from fdnt_xp.fourier.psf import (
+    CIRCLE_POINTS,
+    CIRCLES,
+    Psf,
+    power_on_circles,
+    transform_on_modes,
+)
 from fdnt_xp.fourier.transform import DeconvolvedStamps, complex_like
 
-_RADII, _ANGLES = 25, 24
-"""Of the polar table of ln V: circles, and points on half of each. In the angle it is a
-trigonometric polynomial, in the radius a cubic."""
 _DIRECTIONS: Final = 64
 """Over half a turn, among which the largest V is sought."""
 _MARGIN: Final = 0.004
 """By which V_iso lies above the largest V found, for what lies between the directions."""
-_LEAST_POWER: Final = 1e-3
-"""Of the variance: least power of correlated noise that is told from none."""
 _PSFS_AT_ONCE: Final = 64
 """Bounds the memory of the trigonometric sums."""
+_LEAST_POWER: Final = 1e-3
+"""Of the variance: least power of correlated noise that is told from none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,14 +112,16 @@ class DeconvolvedNoise:
     ----------
     power : array, shape (n_psf, n_k)
         V of each PSF on the modes of the data; zero beyond its disc.
-    ln_polar : array, shape (n_psf, n_radius, n_angle)
-        ln V on circles of radius `kmax j/(n_radius - 1)`.
-    kmax : array, shape (n_psf,)
-        rad/pixel.
+    ln_polar : array, shape (n_psf, n_circle, n_point)
+        ln V on the circles of `Psf.ln_power`: in the angle a trigonometric polynomial, in
+        the radius a cubic.
+    circle_kmax, kmax : array, shape (n_psf,)
+        Radius of the outermost circle, and where the weight ends; rad/pixel.
     """
 
     power: Array
     ln_polar: Array
+    circle_kmax: Array
     kmax: Array
 
     @classmethod
@@ -141,13 +146,10 @@ class DeconvolvedNoise:
         n_modes = float(grid.shape[0] * grid.shape[1])
         if n_power > psf.n_psf:
             psf = psf.take(xp.zeros_like(pixels.variance, dtype=xp.int64))
-        parts = []
-        for first in range(0, psf.n_psf, _PSFS_AT_ONCE):
-            rows = slice(first, min(first + _PSFS_AT_ONCE, psf.n_psf))
-            parts.append(_ln_polar(psf, pixels, rows) + math.log(n_modes))
         return cls(
             power=n_modes * pixels.relative_power(grid) * inverse_power,
-            ln_polar=xp.concat(parts, axis=0),
+            ln_polar=_ln_polar(psf, pixels) + math.log(n_modes),
+            circle_kmax=psf.circle_kmax,
             kmax=psf.kmax,
         )
 
@@ -168,14 +170,16 @@ class DeconvolvedNoise:
         like = {"dtype": self.kmax.dtype, "device": device_of(self.kmax)}
         stretch, angle = _sheared_back(gamma)
         n_psf = int(self.kmax.shape[0])
-        angles = np.pi * (np.arange(_ANGLES) + 0.5) / _ANGLES
+        angles = np.pi * (np.arange(CIRCLE_POINTS) + 0.5) / CIRCLE_POINTS
         turned = xp.matmul(self.ln_polar, xp.asarray(_interpolation(angle, angles), **like))
-        lines = xp.reshape(xp.matrix_transpose(turned), (n_psf * _DIRECTIONS, _RADII))
-        radius = np.linspace(0.0, 1.0 / reach, _RADII)
-        t = xp.asarray(np.tile(stretch[:, None] * radius, (n_psf, 1)), **like)
+        lines = xp.reshape(xp.matrix_transpose(turned), (n_psf * _DIRECTIONS, CIRCLES))
+        # Along each direction, from the middle to where the weight ends.
+        along = xp.asarray(stretch[:, None] * np.linspace(0.0, 1.0 / reach, CIRCLES), **like)
+        t = (self.kmax / self.circle_kmax)[:, None, None] * along[None, :, :]
+        t = xp.reshape(t, (n_psf * _DIRECTIONS, CIRCLES))
         row = xp.arange(n_psf * _DIRECTIONS, dtype=xp.int64, device=device_of(self.kmax))
-        along = xp.reshape(cubic_table(lines).evaluate(t, row)[0], (n_psf, _DIRECTIONS, _RADII))
-        largest = cubic_table(xp.max(along, axis=1) + math.log1p(_MARGIN))
+        values = xp.reshape(cubic_table(lines).evaluate(t, row)[0], (n_psf, _DIRECTIONS, CIRCLES))
+        largest = cubic_table(xp.max(values, axis=1) + math.log1p(_MARGIN))
         kappa = xp.sqrt(grid.kx**2 + grid.ky**2)[None, :] * (reach / self.kmax)[:, None]
         return xp.exp(largest.evaluate(kappa, None if n_psf == 1 else row[:n_psf])[0])
 
@@ -226,22 +230,21 @@ class RoundNoise:
         return DeconvolvedStamps(re=galaxies.re + scale * self.re, im=galaxies.im + scale * self.im)
 
 
-def _ln_polar(psf: Psf, pixels: PixelNoise, rows: slice) -> Array:
-    """Return ln P/|T|² on the circles of some PSFs, shape (n_psf, n_radius, n_angle)."""
+def _ln_polar(psf: Psf, pixels: PixelNoise) -> Array:
+    """Return ln P/|T|² on the circles of the PSFs, shape (n_psf, n_circle, n_point)."""
     xp = array_namespace(kmax=psf.kmax)
-    t = xp.linspace(0.0, 1.0, _RADII, dtype=psf.kmax.dtype, device=device_of(psf.kmax))
-    radii = psf.kmax[rows, None] * t[None, :]
-    transfer = power_on_circles(psf.image[rows, :, :], radii, _ANGLES, psf.oversampling)
-    # Within the disc |T|² is above the floor of 𝒯; outside, or for a bad PSF, it may be 0.
-    smallest = float(xp.finfo(transfer.dtype).smallest_normal)
-    ratio = 1.0 / xp.maximum(transfer, xp.full_like(transfer, smallest))
-    correlation = pixels.correlation
-    if correlation is not None:
-        mine = correlation if int(correlation.shape[0]) == 1 else correlation[rows, :, :]
-        relative = xp.sqrt(power_on_circles(mine, radii, _ANGLES, 1.0))
-        # A mode without noise, as k = 0 of an image less its mean, has no logarithm.
-        ratio = ratio * xp.maximum(relative, xp.full_like(relative, _LEAST_POWER))
-    return xp.log(ratio)
+    if pixels.correlation is None:
+        return -psf.ln_power
+    t = xp.linspace(0.0, 1.0, CIRCLES, dtype=psf.kmax.dtype, device=device_of(psf.kmax))
+    radii = psf.circle_kmax[:, None] * t[None, :]
+    parts = []
+    for first in range(0, psf.n_psf, _PSFS_AT_ONCE):
+        rows = slice(first, min(first + _PSFS_AT_ONCE, psf.n_psf))
+        correlation = pixels.rows(rows).correlation
+        parts.append(power_on_circles(correlation, radii[rows, :], CIRCLE_POINTS, 1.0))
+    power = xp.sqrt(xp.concat(parts))
+    # A mode without noise, as k = 0 of an image less its mean, has no logarithm.
+    return xp.log(xp.maximum(power, xp.full_like(power, _LEAST_POWER))) - psf.ln_power
 
 
 def _turned(re: Array, im: Array, grid: KGrid, symmetry: Array) -> tuple[Array, Array]:

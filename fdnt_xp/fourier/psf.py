@@ -26,6 +26,8 @@ _SCAN_RADII, _SCAN_ANGLES = 48, 12
 _TABLE_NODES, _TABLE_ANGLES = 97, 24
 """Nodes of the table of 𝒯. The mean over the angle need not be exact: any isotropic weight
 gives a valid null test. It must be smooth in k, which it is for any number of angles."""
+CIRCLES, CIRCLE_POINTS = 25, 24
+"""Of the table of |T|² on circles, and points on half of each."""
 _PSFS_AT_ONCE = 64
 """Bounds the memory of the trigonometric sums."""
 
@@ -46,6 +48,10 @@ class Psf:
         False where an image is not finite or has no positive sum.
     weight : CubicTable
         `𝒯` as a function of `k/kmax`, one table per PSF.
+    ln_power : array, shape (n_psf, n_circle, n_point)
+        ln |T|² at `circle_kmax j/(n_circle - 1)`, angles `π (l + ½)/n_point`.
+    circle_kmax : array, shape (n_psf,)
+        Radius of the outermost circle, rad/pixel: `kmax` as it was made.
     oversampling : float
         Pixels of `image` per pixel of the galaxies, along one axis.
     largest_kmax : float
@@ -57,6 +63,8 @@ class Psf:
     kmax: Array
     usable: Array
     weight: CubicTable
+    ln_power: Array
+    circle_kmax: Array
     oversampling: float
     largest_kmax: float
 
@@ -110,12 +118,15 @@ class Psf:
             parts.append(_circularise(image[rows, :, :], float(oversampling), floor))
         kmax = xp.concat([part[0] for part in parts])
         weight = xp.concat([part[1] for part in parts])
+        ln_power = xp.concat([part[2] for part in parts])
         return cls(
             image=image,
             centre=centre / oversampling,
             kmax=kmax,
             usable=usable,
             weight=cubic_table(weight, zero_beyond=True),
+            ln_power=ln_power,
+            circle_kmax=kmax,
             oversampling=float(oversampling),
             # In float32 pi is rounded up, past the Nyquist modes.
             largest_kmax=min(float(xp.max(kmax)), np.pi) if n_psf else np.pi,
@@ -129,7 +140,7 @@ class Psf:
     def take(self, rows: Array) -> Psf:
         """Return the PSFs with the given row numbers (integer array), in that order."""
         xp = array_namespace(image=self.image, rows=rows)
-        moved = ("image", "centre", "kmax", "usable")
+        moved = ("image", "centre", "kmax", "usable", "ln_power", "circle_kmax")
         kept = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in moved}
         taken = {name: xp.take(getattr(self, name), rows, axis=0) for name in moved}
         return Psf(**(kept | taken | {"weight": self.weight.take(rows)}))
@@ -254,15 +265,19 @@ def _waves(k: Array, n: int, oversampling: float) -> Array:
     return xp.exp(complex_like(angle) * -1j)
 
 
-def _circularise(image: Array, oversampling: float, floor: float) -> tuple[Array, Array]:
-    """Return `kmax`, shape (n_psf,), and `𝒯` at the table's nodes, shape (n_psf, n_node)."""
+def _circularise(image: Array, oversampling: float, floor: float) -> tuple[Array, Array, Array]:
+    """Return `kmax`, shape (n_psf,), `𝒯` at the table's nodes, and ln |T|² on circles."""
     xp = array_namespace(image=image)
     like = {"dtype": image.dtype, "device": device_of(image)}
     scan = xp.linspace(0.0, np.pi, _SCAN_RADII, **like)[None, :]
     kmax = _first_crossing(scan, _mean_power(image, scan, _SCAN_ANGLES, oversampling), floor)
     t = xp.linspace(0.0, 1.0, _TABLE_NODES, **like)[None, :]
     power = _mean_power(image, kmax[:, None] * t, _TABLE_ANGLES, oversampling)
-    return kmax, _ended_smoothly(power, t)
+    circles = xp.linspace(0.0, 1.0, CIRCLES, **like)[None, :]
+    on_circles = power_on_circles(image, kmax[:, None] * circles, CIRCLE_POINTS, oversampling)
+    # Where a PSF is dark there is no logarithm; the weight ends before.
+    least = xp.full_like(on_circles, float(xp.finfo(image.dtype).smallest_normal))
+    return kmax, _ended_smoothly(power, t), xp.log(xp.maximum(on_circles, least))
 
 
 def _mean_power(image: Array, radii: Array, n_angle: int, oversampling: float) -> Array:
@@ -275,15 +290,15 @@ def _mean_power(image: Array, radii: Array, n_angle: int, oversampling: float) -
 
 
 def power_on_circles(image: Array, radii: Array, n_angle: int, oversampling: float) -> Array:
-    """Return `|T|²` of images on circles, shape (n_psf, n_radius, n_angle).
+    """Return `|T|²` of images on circles, shape (n, n_radius, n_angle).
 
     `|T|` is the same at k and -k, so half a circle is enough; on equidistant points of it
     means over the angle converge exponentially.
 
     Parameters
     ----------
-    image : array, shape (n_psf, ny, nx)
-    radii : array, shape (n_psf or 1, n_radius)
+    image : array, shape (n or 1, ny, nx)
+    radii : array, shape (n or 1, n_radius)
         rad/pixel of the galaxies.
     n_angle : int
         Angles `π (j + ½)/n_angle`.
@@ -307,7 +322,7 @@ def power_on_circles(image: Array, radii: Array, n_angle: int, oversampling: flo
     sin_sum = xp.matmul(xp.sin(phase_x), rows)
     re = xp.sum(cos_sum * cos_y - sin_sum * sin_y, axis=-1)
     im = xp.sum(cos_sum * sin_y + sin_sum * cos_y, axis=-1)
-    return xp.reshape(re**2 + im**2, (int(image.shape[0]), n_radius, n_angle))
+    return xp.reshape(re**2 + im**2, (-1, n_radius, n_angle))
 
 
 def _first_crossing(radii: Array, power: Array, floor: float) -> Array:
