@@ -10,8 +10,9 @@ GPU_BACKENDS ?= torch:cuda
 # JAX compiles every operation for every shape: its run takes the kernels, and the public
 # functions against NumPy, not every shape of every test.
 JAX_TESTS := $(addprefix tests/test_,arrays.py shear.py grid.py transform.py interpolation.py \
-  psf.py forms.py weights.py nulltests.py measure.py::test_libraries_agree \
-  population.py::test_a_ring_gives_its_shear)
+  psf.py forms.py weights.py nulltests.py deviates.py measure.py::test_libraries_agree \
+  population.py::test_a_ring_gives_its_shear round_noise.py::test_the_libraries_agree \
+  responses.py::test_the_libraries_agree)
 
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check

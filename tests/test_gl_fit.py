@@ -14,7 +14,6 @@ from fdnt_xp.nulltests.dogleg import Status
 from fdnt_xp.shapes.fdnt_gl import deconvolve_fit
 from fdnt_xp.shapes.gl_fit import filled, fit_laguerre
 from fdnt_xp.shapes.laguerre import LaguerreBasis, n_coefficients, pixel_positions, position
-from fdnt_xp.shapes.least_squares import LARGEST_INFLATION, least_squares
 from fdnt_xp.shear import shear_matrix
 from images import gaussian_image
 from tolerances import tolerance
@@ -129,28 +128,6 @@ def test_the_covariance_is_the_scatter(to_xp, to_np):
     assert np.mean(chi_square) == pytest.approx(n_coef, abs=4.0 * np.sqrt(2.0 * n_coef / n))
     pulls = d / np.sqrt(np.diagonal(to_np(fit.coefficients_cov), axis1=1, axis2=2))
     np.testing.assert_allclose(np.std(pulls, axis=0), 1.0, atol=4.5 / np.sqrt(2.0 * n))
-
-
-@pytest.mark.parametrize("pattern", ["one pixel", "row", "two rows", "tiny patch", "none"])
-def test_no_pattern_of_pixels_makes_the_batch_raise(pattern, dtype, to_xp, to_np):
-    order, n_pix = 12, SIDE * SIDE
-    use = np.zeros((SIDE, SIDE))
-    rows, columns = {
-        "one pixel": (slice(20, 21), slice(20, 21)),
-        "row": (slice(20, 21), slice(None)),
-        "two rows": (slice(5, 7), slice(None)),
-        "tiny patch": (slice(14, 24), slice(14, 24)),
-        "none": (slice(0), slice(0)),
-    }[pattern]
-    use[rows, columns] = 1.0
-    ivar = np.stack([use.ravel(), np.ones(n_pix)])
-    basis = LaguerreBasis(order=order, eta=ETA[:2], centroid=CENTRE[:2], size=SIZE[:2])
-    functions = basis.in_x(*pixel_positions(np, np.zeros((1, SIDE, SIDE))))
-    pixels = gaussians()[:2].reshape(2, n_pix)
-    fit = least_squares(*(to_xp(a, dtype) for a in (functions, pixels, ivar)))
-    assert to_np(fit.inflation)[0] > LARGEST_INFLATION
-    assert to_np(fit.inflation)[1] < 1.5
-    assert np.all(np.isfinite(to_np(fit.coefficients)))
 
 
 # --- the matched basis ---------------------------------------------------------------
@@ -317,6 +294,19 @@ def test_missing_pixels_are_filled_and_others_untouched(xp, dtype, to_xp, to_np)
     whole = to_np(filled(stamps, ivar, fit_laguerre(stamps, ivar, order=8)))
     np.testing.assert_array_equal(whole[present], to_np(stamps)[present])
     assert np.max(np.abs(whole - truth)[~present]) < 2e-3
+
+
+def test_what_is_not_usable_can_be_made_harmless(to_xp, to_np):
+    present = mask("none")
+    present[1] = mask("quadrant")[1]
+    fit = fit_laguerre(to_xp(gaussians()), to_xp(present.astype(float)), order=12)
+    harmless = fit.harmless()
+    assert to_np(harmless.flags).tolist() == [0, int(Flag.GL_FAILURE), 0]
+    assert to_np(harmless.basis.size)[1] == 1.0
+    for name in ("coefficients", "coefficients_cov"):
+        ours, theirs = to_np(getattr(harmless, name)), to_np(getattr(fit, name))
+        assert np.all(ours[1] == 0.0)
+        np.testing.assert_array_equal(ours[[0, 2]], theirs[[0, 2]])
 
 
 def test_what_cannot_be_fitted_cannot_be_filled(to_xp, to_np):

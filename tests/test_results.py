@@ -37,6 +37,7 @@ def shapes(to_xp, dtype):
         flags=code([0, int(Flag.SIZE_AT_BOUND), int(Flag.NO_SIGNAL)]),
         n_iter=code([4, 5, 6]),
         status=code([0, 0, 4]),
+        masked_fraction=column([0.0, 0.25, 1.0]),
     )
 
 
@@ -98,6 +99,12 @@ def test_the_table_has_a_unit_or_a_description_for_every_column(shapes, to_np):
     np.testing.assert_array_equal(table["eta12_cov"], to_np(shapes.eta_cov)[:, 0, 1])
     np.testing.assert_array_equal(table["e1"], to_np(shapes.e)[:, 0])
     np.testing.assert_array_equal(table["y"], to_np(shapes.centroid)[:, 1])
+
+
+def test_nothing_is_missing_unless_said(shapes, xp):
+    given = {f.name: getattr(shapes, f.name) for f in fields(shapes) if f.name != "masked_fraction"}
+    whole = fx.ShapeResult(**given)
+    assert_equal(whole.masked_fraction, xp.zeros_like(shapes.masked_fraction), xp=xp)
 
 
 # --- no rows, every column, every flag -----------------------------------------------

@@ -16,9 +16,8 @@ from fdnt_xp.shapes.gl_fit import LaguerreFit, fit_laguerre
 from fdnt_xp.shapes.pixels import Pixels
 
 BASIS_SCALE: Final = 1.1
-"""Size of the basis over the matched one. The wings of a galaxy decide how well few functions
-do: 1.1 is better than 1.0 by up to a factor of two where it matters (docs, "Gauss-Laguerre
-fits")."""
+"""Size of the basis over the matched one. A larger one follows the wings of n = 2 and 4 better, and
+n = 1 behind a mask worse (docs, "Gauss-Laguerre fits")."""
 
 
 def fit_pixels_of(pixels: Pixels, order: int) -> LaguerreFit:

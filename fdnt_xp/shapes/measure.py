@@ -95,7 +95,7 @@ def measure_shapes(
         the galaxy is round. By default it is matched to each galaxy.
     padding : int
         Makes the k grid finer by this factor for all galaxies. Without it only the most
-        elongated are measured on a grid twice as fine.
+        elongated are measured on a grid twice as fine, and with "gl" all.
     max_iter : int
         Steps of the root finder.
     chunk_size : int, optional
@@ -147,8 +147,7 @@ def measure_shapes(
         return ShapeResult.unmeasured(stamps)
 
     job = prepare(xp, stamps, psf, padding, size, max_iter)
-    more = _more_numbers(job, pixels, transform, order)
-    n_chunk = chunk_size or galaxies_at_once(job.coarse, stamps, more)
+    n_chunk = chunk_size or _galaxies_at_once(job, pixels, transform, order)
     parts = []
     for start in range(0, n_gal, n_chunk):
         rows = slice(start, min(start + n_chunk, n_gal))
@@ -170,6 +169,8 @@ def _measure_chunk(job: Job, pixels: Pixels, transform: Transform, order: int) -
         xp = array_namespace(flags=flags)
         masked = (flags == 0) & (masked_fraction > 0)
         flags = xp.where(masked, xp.full_like(flags, int(Flag.MASKED)), flags)
+        # What is left of a stamp may be next to nothing, and its numbers beyond all range.
+        pixels = pixels.kept(flags == 0)
         result = _measure_source(job, UnevenStamps(pixels=pixels), pixels, flags)
     return replace(result, masked_fraction=masked_fraction)
 
@@ -180,7 +181,8 @@ def _measure_fits(job: Job, pixels: Pixels, flags: Array, order: int) -> ShapeRe
     fit = fit_pixels_of(pixels, order)
     flags = xp.where(flags == 0, fit.flags, flags)
     source = FittedStamps(fit=fit.harmless(), variance=pixels.variance)
-    return _measure_source(job, source, pixels, flags)
+    # The functions reach out of the stamp, and a coarser grid would fold them back in.
+    return _measure_on(job, job.fine, source, pixels.stamp_shape, flags)[0]
 
 
 def _measure_filled(job: Job, pixels: Pixels, flags: Array, order: int) -> ShapeResult:
@@ -195,7 +197,7 @@ def _measure_filled(job: Job, pixels: Pixels, flags: Array, order: int) -> Shape
         rows = place[:n_masked]
         gappy = pixels.take(rows)
         fit = fit_pixels_of(gappy, order)
-        source = filled_stamps(gappy, fit.harmless())
+        source = filled_stamps(gappy, fit)
         reasons = xp.where(fit.usable, xp.full_like(fit.flags, int(Flag.FILLED)), fit.flags)
         parts.append(_measure_source(job.take(rows), source, gappy, reasons))
     if n_masked < int(flags.shape[0]):
@@ -278,16 +280,15 @@ def _check_transform(transform: str, order: int, stamps: Array) -> None:
         check_fit_order(order, stamps)
 
 
-def _more_numbers(job: Job, pixels: Pixels, transform: Transform, order: int) -> int:
-    """Return how many numbers a galaxy takes beyond what its null tests take."""
+def _galaxies_at_once(job: Job, pixels: Pixels, transform: Transform, order: int) -> int:
+    """Return how many galaxies fit the memory of a chunk."""
     ny, nx = pixels.stamp_shape
+    grid = job.fine if transform == "gl" else job.coarse
     n_coef = n_coefficients(order)
     more = 0
-    if transform != "ft":
-        more += 3 * n_coef**2
     if transform == "gl":
-        more += (n_coef + 6 * N_FUNCTIONALS) * job.coarse.n_k
+        more = 3 * n_coef**2 + (n_coef + 6 * N_FUNCTIONALS) * grid.n_k
     elif pixels.ivar is not None:
-        more += 8 * N_FUNCTIONALS * ny * nx + 6 * N_FUNCTIONALS * job.coarse.n_k
-        more += n_coef * ny * nx if transform == "hybrid" else 0
-    return more
+        more = 8 * N_FUNCTIONALS * ny * nx + 6 * N_FUNCTIONALS * grid.n_k
+        more += 3 * n_coef**2 + n_coef * ny * nx if transform == "hybrid" else 0
+    return galaxies_at_once(grid, pixels.stamps, more)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
 
 from fdnt_xp.arrays import Array, array_namespace, as_floating, require_dtype
@@ -51,6 +51,12 @@ class Pixels:
             variance=xp.take(self.variance, rows, axis=0),
             ivar=None if self.ivar is None else xp.take(self.ivar, rows, axis=0),
         )
+
+    def kept(self, keep: Array) -> Pixels:
+        """Return the same with stamps of zeros where `keep`, shape (n_gal,), is False."""
+        xp = array_namespace(keep=keep)
+        zero = xp.zeros_like(self.stamps)
+        return replace(self, stamps=xp.where(keep[:, None, None], self.stamps, zero))
 
     def masked_fraction(self) -> Array:
         """Return the part of the pixels that is missing, shape (n_gal,)."""

@@ -6,7 +6,7 @@ variance for each pixel, some of them filled from a fit; and fits alone (FDNT-GL
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from fdnt_xp.arrays import Array, array_namespace
@@ -172,8 +172,7 @@ class FittedStamps:
 
 
 def filled_stamps(pixels: Pixels, fit: LaguerreFit) -> UnevenStamps:
-    """Return stamps whose missing pixels are those of a fit that is finite."""
-    stamps = filled(pixels.stamps, pixels.ivar, fit)
-    return UnevenStamps(
-        pixels=Pixels(stamps=stamps, variance=pixels.variance, ivar=pixels.ivar), fit=fit
-    )
+    """Return stamps whose missing pixels are those of a fit; zeros where it is not usable."""
+    fit = fit.harmless()
+    whole = replace(pixels, stamps=filled(pixels.stamps, pixels.ivar, fit))
+    return UnevenStamps(pixels=whole.kept(fit.usable), fit=fit)
