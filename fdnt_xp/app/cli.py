@@ -22,6 +22,7 @@ from fdnt_xp.app.plots import check_figure, plot_catalog, save_figure
 from fdnt_xp.app.ring import RingOptions, run_ring
 from fdnt_xp.app.shear import catalog_shear, report_lines
 from fdnt_xp.app.summary import summary_lines
+from fdnt_xp.app.underfitting_figure import UnderfittingFigure, draw_underfitting_figure
 from fdnt_xp.data.catalog import check_catalog, read_catalog, write_catalog
 from fdnt_xp.data.noise_estimators import ESTIMATORS
 from fdnt_xp.data.versions import KINDS
@@ -444,3 +445,23 @@ def ellipticity_gradient(output: str, table: str | None, overwrite: bool, **opti
     """Ring tests of the three galaxies of Bernstein 2010, against the size of the PSF."""
     figure = GradientFigure(**options)
     draw_gradient_figure(figure, output, table, overwrite=overwrite, say=click.echo)
+
+
+@figures.command(name="underfitting", cls=_Command)
+@click.option(
+    "-o",
+    "--output",
+    default="underfitting.png",
+    show_default=True,
+    metavar="FIGURE",
+    help=".png, .pdf or .svg.",
+)
+@click.option("--table", metavar="TABLE", help="Numbers to write: .json, .ecsv, .fits, .parquet.")
+@click.option("--stamp", type=int, default=128, show_default=True, help="Pixels on a side.")
+@click.option("--padding", type=int, default=1, show_default=True, help="Makes the k grid finer.")
+@_WHERE
+@_OVERWRITE
+def underfitting(output: str, table: str | None, overwrite: bool, **options: Any) -> None:
+    """Bias and noise of NB07, FDNT-GL and FDNT-FT on Sersic galaxies, as in Bernstein 2010."""
+    figure = UnderfittingFigure(**options)
+    draw_underfitting_figure(figure, output, table, overwrite=overwrite, say=click.echo)

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import ModuleType
 from typing import Final, TypeAlias
 
-from fdnt_xp.arrays import Array, array_namespace, as_floating, device_of, require_dtype
-from fdnt_xp.errors import RangeError, ShapeMismatchError
+from fdnt_xp.arrays import Array, array_namespace, device_of
 from fdnt_xp.flags import FAILED, Flag
 from fdnt_xp.fourier.psf import Psf
 from fdnt_xp.nulltests.dogleg import Status
 from fdnt_xp.shapes.job import check_options, check_stamps, screen
+from fdnt_xp.shapes.pixels import noise_column
 from fdnt_xp.shapes.results import ShapeResult
 
 MOST_ELLIPTICAL: Final = 4.0
@@ -84,26 +82,6 @@ def measure_in_chunks(
         clean, flags = screen(stamps[start:stop, :, :], mine)
         parts.append(measure(clean, mine, noise[start:stop], flags))
     return ShapeResult.concat(parts)
-
-
-def noise_column(xp: ModuleType, noise_variance: float | Array | None, stamps: Array) -> Array:
-    """Return the noise variance of each galaxy, NaN where unknown; shape (n_gal,)."""
-    like = stamps[:, 0, 0]
-    if noise_variance is None:
-        return xp.full_like(like, float("nan"))
-    if isinstance(noise_variance, int | float):
-        if not (math.isfinite(noise_variance) and noise_variance >= 0):
-            raise RangeError("noise_variance", float(noise_variance), 0.0, None)
-        return xp.full_like(like, float(noise_variance))
-    array_namespace(stamps=stamps, noise_variance=noise_variance)
-    noise = as_floating(xp, noise_variance, "noise_variance")
-    require_dtype(stamps.dtype, noise_variance=noise)
-    if noise.shape not in ((), like.shape):
-        raise ShapeMismatchError(
-            f"noise_variance must be a number or have the shape {tuple(like.shape)}, "
-            f"not {tuple(noise.shape)}"
-        )
-    return xp.broadcast_to(noise, like.shape)
 
 
 def in_domain(eta: Array, centroid: Array, size: Array, side: int) -> Array:

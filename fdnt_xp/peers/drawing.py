@@ -50,9 +50,7 @@ class Drawing:
     ) -> Drawing:
         """Return the drawing through a PSF, on a k grid `padding` times finer than the stamp's."""
         padded = (padding * stamp_shape[0], padding * stamp_shape[1])
-        grid = half_plane_disc(
-            xp, padded, float(np.pi), dtype=dtype, device=device_of(psf.image)
-        )
+        grid = half_plane_disc(xp, padded, float(np.pi), dtype=dtype, device=device_of(psf.image))
         axis_x, axis_y = half_plane_axes(grid)
         both = (int(axis_y.shape[0]), int(axis_x.shape[0]))
         kx = xp.reshape(xp.broadcast_to(axis_x[None, :], both), (-1,))
@@ -67,16 +65,19 @@ class Drawing:
             padded_shape=padded,
         )
         # The PSF comes to its centroid, and x = 0 from pixel (0, 0) to the stamp's centre.
-        middle = xp.asarray(
-            [[0.5 * (stamp_shape[1] - 1), 0.5 * (stamp_shape[0] - 1)]],
-            dtype=dtype,
-            device=device_of(psf.image),
-        )
-        moved = drawing.phase(middle - xp.astype(psf.centre, dtype))
-        below = 1.0 - 1e-6  # of Nyquist's mode, which is its own conjugate: no phase there
-        inside = (xp.abs(kx) < below * np.pi) & (xp.abs(ky) < below * np.pi)
-        transfer = drawing.transfer * moved
-        return replace(drawing, transfer=xp.where(inside, transfer, xp.zeros_like(transfer)))
+        bare = drawing.without_psf()
+        moved = bare.transfer * drawing.phase(-xp.astype(psf.centre, dtype))
+        return replace(drawing, transfer=drawing.transfer * moved)
+
+    def without_psf(self) -> Drawing:
+        """Return the drawing of images that are seen as they are."""
+        xp = array_namespace(kx=self.kx)
+        ny, nx = self.stamp_shape
+        like = {"dtype": self.kx.dtype, "device": device_of(self.kx)}
+        moved = self.phase(xp.asarray([[0.5 * (nx - 1), 0.5 * (ny - 1)]], **like))
+        below = (1.0 - 1e-6) * float(np.pi)  # Nyquist's mode is its own conjugate: no phase there
+        inside = (xp.abs(self.kx) < below) & (xp.abs(self.ky) < below)
+        return replace(self, transfer=xp.where(inside, moved, xp.zeros_like(moved)))
 
     def take(self, rows: Array) -> Drawing:
         """Return the drawing of the given galaxies (integer array)."""

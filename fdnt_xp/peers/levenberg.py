@@ -21,7 +21,7 @@ _RIDGE: Final = 10.0
 _FIRST_DAMPING: Final = 1e-2
 _LARGEST_STEP: Final = 1.5
 _ACCEPT: Final = 1e-4
-_NO_WORSE: Final = 8.0  # eps: chi² is not known better
+_NO_WORSE: Final = 4.0  # eps |r|: chi² is not known better, r being data of length 1 minus model
 _COMPACT_BELOW: Final = 0.75
 
 
@@ -173,14 +173,16 @@ def _step(xp: ModuleType, problem: LeastSquaresProblem, state: _State, gtol: flo
     step = xp.where(running[:, None], step, xp.zeros_like(step))
     chi2, g, h, scale, inside = _evaluated(xp, problem, state.x + step)
     real = state.chi2 - chi2
-    accept = running & inside & (real >= _ACCEPT * promised - _NO_WORSE * eps * state.chi2)
+    rounding = _NO_WORSE * eps * xp.sqrt(state.chi2)
+    accept = running & inside & (real >= _ACCEPT * promised - rounding)
 
     # Nielsen's rule; the ratio means nothing where chi² cannot resolve what was promised.
-    resolved = promised > _NO_WORSE * eps * state.chi2
+    resolved = promised > rounding
     ratio = xp.where(resolved, real / _safe(xp, promised), xp.ones_like(real))
     ratio = xp.minimum(xp.maximum(ratio, xp.zeros_like(ratio)), xp.full_like(ratio, 2.0))
     shrink = xp.maximum(1.0 - (2.0 * ratio - 1.0) ** 3, xp.full_like(ratio, 0.1))
     damping = state.damping * xp.where(accept, shrink, state.growth)
+    growth = xp.where(accept, xp.full_like(damping, 2.0), 2.0 * state.growth)
     chosen = accept[:, None]
     x = xp.where(chosen, state.x + step, state.x)
     g = xp.where(chosen, g, state.g)
@@ -198,8 +200,8 @@ def _step(xp: ModuleType, problem: LeastSquaresProblem, state: _State, gtol: flo
         g=g,
         h=h,
         scale=scale,
-        damping=damping,
-        growth=xp.where(accept, xp.full_like(damping, 2.0), 2.0 * state.growth),
+        damping=xp.where(running, damping, state.damping),
+        growth=xp.where(running, growth, state.growth),
         status=xp.where(running, status, state.status),
         n_eval=state.n_eval + xp.astype(running, xp.int32),
     )

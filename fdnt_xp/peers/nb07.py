@@ -1,9 +1,15 @@
 """NB07: Gauss-Laguerre functions fitted to the galaxy before the PSF, through the PSF.
 
-Nakajima and Bernstein (2007; B10 §2.1): the functions of a trial centre, shape and size are
-convolved with the PSF and fitted to the pixels; the centre, shape and size are those at which
-`b10 = b20 = b11 = 0`. The convolved functions are `psi~(k) T(k)`, transformed back to pixels:
-their transforms are known, and a fit of pixels needs nothing to be known beyond the stamp.
+Nakajima and Bernstein (2007; B10 §2.1): the functions of a trial centre and shape are convolved
+with the PSF and fitted to the pixels; the galaxy has the centre and shape at which
+`b10 = b20 = 0`. The convolved functions are `psi~(k) T(k)`, transformed back to pixels: their
+transforms are known, and a fit of pixels needs nothing to be known beyond the stamp.
+
+The size of the basis is where `b11 = 0` in the image as it is observed, at order 2: that of the
+Gaussian of the greatest likelihood there. In the image before the PSF no zero of `b11` was found
+for an exponential galaxy behind a PSF of its size, nor for any de Vaucouleurs galaxy; and a
+basis of the size of the best Gaussian before the PSF leaves poorly resolved galaxies with
+errors of 40 % and more, or without a root.
 
 The functions of high order differ by what the PSF hardly lets pass, and the normal equations
 lose digits with them: all is computed in float64, whatever the precision of the stamps.
@@ -20,21 +26,21 @@ from numpy.typing import NDArray
 
 from fdnt_xp.arrays import Array, array_namespace, device_of
 from fdnt_xp.fourier.psf import Psf
-from fdnt_xp.nulltests.dogleg import DoglegOptions, find_root, newton_step
+from fdnt_xp.nulltests.dogleg import DoglegOptions, Status, find_root, newton_step
 from fdnt_xp.nulltests.tests import inverse_if_positive
 from fdnt_xp.peers.batch import Fitted, in_domain, measure_in_chunks, shapes_of
-from fdnt_xp.peers.circular import CIRCULAR_METHODS, ImageFit
+from fdnt_xp.peers.circular import CIRCULAR_METHODS
 from fdnt_xp.peers.drawing import Drawing
+from fdnt_xp.peers.image_fit import ImageFit
 from fdnt_xp.peers.levenberg import find_minimum
-from fdnt_xp.shapes.least_squares import LinearFit, least_squares
 from fdnt_xp.shapes.laguerre import (
-    MAX_ORDER,
     LaguerreBasis,
     degrees,
     generators,
     n_coefficients,
     position,
 )
+from fdnt_xp.shapes.least_squares import LinearFit, least_squares
 from fdnt_xp.shapes.results import ShapeResult
 
 FINER: Final = 2
@@ -47,7 +53,6 @@ _TESTS: Final = (
     position(1, 0, sine=True),
     position(2, 0),
     position(2, 0, sine=True),
-    position(1, 1),
 )
 
 
@@ -110,43 +115,48 @@ class Nb07Method:
         )
 
     def _fit(self, drawing: Drawing, stamps: Array, size: float | None) -> Fitted:
-        """Start from the Gaussian of the greatest likelihood, and solve the null tests."""
+        """Size the basis, start from the Gaussian of the greatest likelihood, solve the tests."""
         xp = array_namespace(stamps=stamps)
         gaussian = CIRCULAR_METHODS["gauss-1"]
-        first = ImageFit.of(drawing, gaussian.profile, stamps, size=size)
+        first = ImageFit.of(drawing, gaussian.profile, stamps, size=None)
         at = find_minimum(first, first.start(gaussian.start), max_iter=gaussian.max_iter)
+        seen = replace(first, drawing=drawing.without_psf())
+        as_seen = find_minimum(seen, seen.start(1.0), max_iter=gaussian.max_iter)
+        sigma = xp.exp(as_seen.x[:, 4])
+        if size is not None:
+            sigma = xp.full_like(sigma, size)
         tests = ConvolvedTests(
             drawing=drawing,
             order=self.order,
             pixels=first.pixels,
             length=first.length,
-            fixed_size=size,
+            size=sigma,
         )
-        options = DoglegOptions(ftol=_FTOL, max_iter=self.max_iter, max_radius=1.0)
-        options = replace(options, initial_radius=0.5)
-        root = find_root(tests, at.x, options=options)
-        eta, centroid, sigma = tests.parameters(root.x)
-        fit, jac, _ = tests.solved(root.x)
+        options = DoglegOptions(
+            ftol=_FTOL, max_iter=self.max_iter, initial_radius=0.5, max_radius=1.0
+        )
+        root = find_root(tests, at.x[:, :4], options=options)
+        fit, _, _ = tests.solved(root.x)
         b00 = fit.coefficients[:, 0]
         to_flux = first.norm * sigma * (2.0 * np.pi**0.5)
-        covariance, regular = _covariance(root.jac, fit, b00, fixed=size is not None)
-        del jac
+        covariance, regular = _covariance(root.jac, fit)
+        lost = as_seen.status != int(Status.CONVERGED)
         return Fitted(
-            eta=eta,
+            eta=root.x[:, 2:],
             eta_cov=covariance / (first.norm**2)[:, None, None],
-            centroid=centroid,
+            centroid=first.length[:, None] * root.x[:, :2],
             size=sigma,
             flux=b00 * to_flux,
             flux_variance=fit.covariance[:, 0, 0] * (to_flux / first.norm) ** 2,
             regular=regular & (fit.inflation < LARGEST_INFLATION),
-            status=root.status,
-            n_eval=root.n_eval + at.n_eval,
+            status=xp.where(lost, as_seen.status, root.status),
+            n_eval=root.n_eval + at.n_eval + as_seen.n_eval,
         )
 
 
 @dataclass(frozen=True, kw_only=True)
 class ConvolvedTests:
-    """`b10`, `b20` and `b11` over `b00`: a `RootProblem` in `(x0/L, y0/L, eta1, eta2, ln sigma)`.
+    """`b10` and `b20` over `b00`: a `RootProblem` in `(x0/L, y0/L, eta1, eta2)`.
 
     Parameters
     ----------
@@ -154,17 +164,15 @@ class ConvolvedTests:
     order : int
     pixels : array, shape (n_gal, n_pix)
         The sum of their squares is 1.
-    length : array, shape (n_gal,)
-        L, pixels.
-    fixed_size : float or None
-        sigma, if it is not free: the last test is then ln sigma itself.
+    length, size : array, shape (n_gal,)
+        L and sigma, pixels.
     """
 
     drawing: Drawing
     order: int
     pixels: Array
     length: Array
-    fixed_size: float | None
+    size: Array
 
     def take(self, rows: Array) -> ConvolvedTests:
         """Return the tests of the given galaxies (integer array)."""
@@ -174,15 +182,11 @@ class ConvolvedTests:
             drawing=self.drawing.take(rows),
             pixels=xp.take(self.pixels, rows, axis=0),
             length=xp.take(self.length, rows, axis=0),
+            size=xp.take(self.size, rows, axis=0),
         )
 
-    def parameters(self, x: Array) -> tuple[Array, Array, Array]:
-        """Return shape, centroid in pixels from the stamp's centre, and size."""
-        xp = array_namespace(x=x)
-        return x[:, 2:4], self.length[:, None] * x[:, :2], xp.exp(x[:, 4])
-
     def evaluate(self, x: Array) -> tuple[Array, Array]:
-        """Return the tests, shape (n_gal, 5), and their Jacobian, (n_gal, 5, 5)."""
+        """Return the tests, shape (n_gal, 4), and their Jacobian, (n_gal, 4, 4)."""
         xp = array_namespace(x=x)
         fit, slopes, sane = self.solved(x)
         b00 = fit.coefficients[:, 0]
@@ -191,21 +195,13 @@ class ConvolvedTests:
         f = xp.stack([fit.coefficients[:, j] for j in _TESTS], axis=-1) * inverse
         by_test = xp.stack([slopes[:, :, j] for j in _TESTS], axis=-1)
         jac = (by_test - slopes[:, :, :1] * f[:, None, :]) * inverse[:, :, None]
-        jac = xp.matrix_transpose(jac)
-        if self.fixed_size is None:
-            return f, jac
-        last = x[:, 4:] - float(np.log(self.fixed_size))
-        pinned = xp.concat([xp.zeros_like(f[:, :4]), xp.ones_like(last)], axis=-1)
-        return (
-            xp.concat([f[:, :4], last], axis=-1),
-            xp.concat([jac[:, :4, :], pinned[:, None, :]], axis=1),
-        )
+        return f, xp.matrix_transpose(jac)
 
     def solved(self, x: Array) -> tuple[LinearFit, Array, Array]:
         """Return the fit, what the unknowns do to its coefficients, and where the basis is sane.
 
         Moving the basis changes an image by the generators, up to two orders higher; what the
-        fit makes of that change is the slope, shape (n_gal, 5, n_coef). It leaves out that the
+        fit makes of that change is the slope, shape (n_gal, 4, n_coef). It leaves out that the
         functions move against the residual too.
         """
         xp = array_namespace(x=x)
@@ -218,7 +214,7 @@ class ConvolvedTests:
         matrix = xp.asarray(_generators_of(self.order), **like)
         n_wide = int(drawn.shape[1])
         moved = xp.reshape(xp.matmul(fit.coefficients, matrix), (-1, 6, n_wide))
-        changes = xp.matmul(basis.moves(self.length), moved)
+        changes = xp.matmul(basis.moves(self.length)[:, :4, :], moved)
         images = xp.matmul(changes, drawn)
         right = xp.matmul(images, xp.matrix_transpose(functions))
         return fit, xp.matmul(right, fit.covariance), sane
@@ -226,7 +222,7 @@ class ConvolvedTests:
     def _basis(self, x: Array) -> tuple[LaguerreBasis, Array]:
         """Return a basis two orders higher, a unit circle where absurd, and where it is not."""
         xp = array_namespace(x=x)
-        eta, centroid, size = self.parameters(x)
+        eta, centroid, size = x[:, 2:], self.length[:, None] * x[:, :2], self.size
         sane = in_domain(eta, centroid, size, min(self.drawing.stamp_shape))
         basis = LaguerreBasis(
             order=self.order + 2,
@@ -247,24 +243,21 @@ class ConvolvedTests:
         return self.drawing.images(functions * seen[:, None, :] * powers[None, :, None])
 
 
-def _covariance(jac: Array, fit: LinearFit, b00: Array, *, fixed: bool) -> tuple[Array, Array]:
+def _covariance(jac: Array, fit: LinearFit) -> tuple[Array, Array]:
     """Return `J⁻¹ Cov(t) J⁻ᵀ` of eta, and where J is regular.
 
     The tests vanish at the root: the noise of b00 does not matter.
     """
     xp = array_namespace(jac=jac)
-    n_tests = 4 if fixed else 5
-    unit = xp.eye(5, dtype=jac.dtype, device=device_of(jac))
+    b00 = fit.coefficients[:, 0]
+    unit = xp.eye(4, dtype=jac.dtype, device=device_of(jac))
     columns, regular = [], b00 > 0
-    for j in range(n_tests):
+    for j in range(4):
         column, solved = newton_step(xp, -xp.broadcast_to(unit[j, :], jac.shape[:2]), jac)
-        columns.append(column[:, 2:4])
+        columns.append(column[:, 2:])
         regular = regular & solved
     to_eta = xp.stack(columns, axis=-1)
-    rows = [
-        xp.stack([fit.covariance[:, i, j] for j in _TESTS[:n_tests]], axis=-1)
-        for i in _TESTS[:n_tests]
-    ]
+    rows = [xp.stack([fit.covariance[:, i, j] for j in _TESTS], axis=-1) for i in _TESTS]
     square = xp.where(b00 > 0, b00, xp.ones_like(b00)) ** 2
     tests = xp.stack(rows, axis=1) / square[:, None, None]
     return xp.matmul(xp.matmul(to_eta, tests), xp.matrix_transpose(to_eta)), regular
@@ -286,4 +279,3 @@ def _in_precision(shapes: ShapeResult, stamps: Array) -> ShapeResult:
 
 NB07_METHODS: Final = {f"nb07-{n}": Nb07Method(order=n) for n in (8, 12)}
 """By the names they are registered by; "nb07" is the first."""
-assert max(method.order for method in NB07_METHODS.values()) <= MAX_ORDER - 2
