@@ -99,6 +99,17 @@ def test_shapes_are_true(folder, drawn):
         assert np.max(np.abs(table[name] - drawn.truth[name])) < 0.06
 
 
+@pytest.mark.parametrize("method", ["fdnt-gl", "exponential"])
+def test_any_method(method, folder):
+    run(*CUBE, "-o", "catalog.fits", "--method", method)
+    run(*CUBE, "-o", "ft.fits")
+    catalog, ft = read_catalog("catalog.fits"), read_catalog("ft.fits")
+    assert catalog.meta["METHOD"] == method
+    assert ft.meta["METHOD"] == "fdnt-ft"
+    np.testing.assert_allclose(catalog["e1"], ft["e1"], atol=0.2)
+    assert np.any(catalog["e1"] != ft["e1"])
+
+
 def test_the_three_layouts_agree(folder):
     for arguments, name in ((GRID, "grid"), (CUBE, "cube"), (POSITIONS, "positions")):
         run(*arguments, "--noise-variance", 1e6, "-o", f"out-{name}.fits")
@@ -213,6 +224,11 @@ def test_backgrounds_are_warned_of(folder, drawn):
         (("cut.fits", "--psf", "psf.fits", "--cell", 48), "cut.fits: it is truncated"),
         (("image.fits", "--psf", "psf.fits", "--cell", 48, "--noise-variance", -1), "= -1"),
         (("image.fits", "--psf", "psf.fits", "--cell", 48, "--device", "cuda"), "cpu only"),
+        (("image.fits", "--psf", "psf.fits", "--cell", 48, "--method", "no"), "fdnt-gl"),
+        (
+            ("cube.fits", "--psf", "psf.fits", "--method", "fdnt-gl", "--responses"),
+            "not --responses",
+        ),
     ],
 )
 def test_what_cannot_be_measured(arguments, message, folder, drawn):

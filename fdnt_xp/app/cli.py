@@ -160,6 +160,12 @@ def main() -> None:
     help="Catalog to write: .fits, .ecsv or .parquet.",
 )
 @click.option(
+    "--method",
+    default="fdnt-ft",
+    show_default=True,
+    help="Shape method: fdnt-ft, fdnt-gl, nb07, gauss-1, exponential, ...",
+)
+@click.option(
     "--responses",
     is_flag=True,
     help="Measure responses to shear, for the command shear, not shapes.",

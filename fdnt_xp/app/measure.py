@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import fdnt_xp.peers  # noqa: F401  gives its methods their names
 from fdnt_xp.app.backends import Backend, load_backend
 from fdnt_xp.app.responses import measure_source_responses
 from fdnt_xp.app.runner import Noise, find_noise, measure_source
@@ -15,6 +16,7 @@ from fdnt_xp.data.provenance import Value, provenance
 from fdnt_xp.data.stamps import StampSource, cube_stamps, grid_stamps, position_stamps
 from fdnt_xp.data.tables import read_positions
 from fdnt_xp.errors import CatalogError, FdntValueError
+from fdnt_xp.shapes.methods import shape_method
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -86,6 +88,8 @@ class Settings:
         No progress bar.
     responses : bool
         Whether to measure responses to shear, not shapes.
+    method : str
+        Of the shapes, by its name in `fdnt_xp.shapes.methods`.
     seed : int
         Of their synthetic noise.
     """
@@ -99,6 +103,7 @@ class Settings:
     chunk: int | None = None
     quiet: bool = False
     responses: bool = False
+    method: str = "fdnt-ft"
     seed: int = 0
 
 
@@ -137,6 +142,9 @@ def open_source(inputs: Inputs) -> StampSource:
 def measure_files(inputs: Inputs, settings: Settings) -> tuple[Table, float]:
     """Measure an image; return the catalog with its provenance, and the seconds it took."""
     backend = load_backend(settings.backend, settings.device, settings.dtype)
+    method = shape_method(settings.method)
+    if settings.responses and settings.method != "fdnt-ft":
+        raise FdntValueError("--method chooses how shapes are measured, not --responses")
     source = open_source(inputs)
     psf_pixels: Pixels = read_image(inputs.psf, ndim=(2, 3), what="PSF image")
     blank = None
@@ -161,6 +169,7 @@ def measure_files(inputs: Inputs, settings: Settings) -> tuple[Table, float]:
             source,
             psf_pixels,
             backend=backend,
+            method=method,
             noise_variance=noise.variance,
             oversampling=settings.oversampling,
             size=settings.size,
@@ -178,7 +187,7 @@ def _facts(
     """Return the header of the catalog."""
     positions = inputs.layout == "positions"
     return provenance(
-        method="responses" if settings.responses else "shapes",
+        method="responses" if settings.responses else settings.method,
         backend=backend.library,
         libver=backend.version,
         device=backend.device,

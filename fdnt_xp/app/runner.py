@@ -21,6 +21,7 @@ from fdnt_xp.data.stamps import StampChunk, StampSource
 from fdnt_xp.errors import FdntValueError, FdntWarning, RangeError, ShapeMismatchError
 from fdnt_xp.fourier.psf import Psf
 from fdnt_xp.shapes.measure import measure_shapes
+from fdnt_xp.shapes.methods import ShapeMethod
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -124,6 +125,7 @@ def measure_source(
     *,
     backend: Backend,
     noise_variance: float | None,
+    method: ShapeMethod = measure_shapes,
     oversampling: int = 1,
     size: float | None = None,
     chunk: int | None = None,
@@ -141,6 +143,8 @@ def measure_source(
         Where to compute.
     noise_variance : float or None
         Per pixel.
+    method : callable
+        One of `fdnt_xp.shapes.methods`.
     oversampling : int
         PSF pixels per image pixel.
     size : float, optional
@@ -162,7 +166,7 @@ def measure_source(
     """
 
     def measure(_: StampChunk, stamps: Array, psf: Psf) -> Table:
-        return measure_shapes(stamps, psf, noise_variance=noise_variance, size=size).to_table()
+        return method(stamps, psf, noise_variance=noise_variance, size=size).to_table()
 
     psfs = ChunkPsfs.of(psf_pixels, source, backend, oversampling)
     return measure_chunks(source, psfs, measure, chunk=chunk, quiet=quiet)

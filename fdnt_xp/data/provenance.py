@@ -17,7 +17,7 @@ COMMENTS: Final[dict[str, str]] = {
     "FDNTVER": "its version",
     "NUMPYVER": "version of NumPy",
     "DATE": "when it was made (UTC)",
-    "METHOD": "what was measured: shapes, responses",
+    "METHOD": "shape method, or responses",
     "BACKEND": "array library",
     "LIBVER": "its version",
     "DEVICE": "where the arrays were",

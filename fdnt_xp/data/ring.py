@@ -15,6 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+import fdnt_xp.peers  # noqa: F401  gives its methods their names
 from fdnt_xp.arrays import Array, array_namespace, device_of, to_numpy
 from fdnt_xp.data.profiles import is_inversion_symmetric, load_galsim
 from fdnt_xp.errors import FdntValueError, FdntWarning, RangeError
