@@ -2,7 +2,7 @@
 
 An image that a PSF has smoothed holds next to nothing at high k, so its pixels are not
 independent of each other: a few that are missing follow from the rest. They are set to what
-minimises the power of the image against what the PSF passes,
+minimises the power of the image against what the PSF passes::
 
     sum_k |D(k)|² Λ(k),   Λ(k) = 1/(|T(k)|² + ε),
 

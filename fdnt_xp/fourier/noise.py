@@ -3,7 +3,7 @@
 On the deconvolved image, stationary noise has the power `V(k) = N P(k)/|T(k)|²`, with N the
 pixels of the transform and P their power: the variance of a pixel, if pixels are
 independent. V is no function of `|k|`, nor of `|kappa|` in the frame `kappa = S_gamma k` of
-a trial shear. Gaussian noise of the power
+a trial shear. Gaussian noise of the power::
 
     V_iso(|kappa|; gamma) - V(k),   V_iso(r; gamma) = max over θ of V(S_gamma⁻¹ r (cosθ, sinθ))
 

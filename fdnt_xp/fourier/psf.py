@@ -27,7 +27,7 @@ _TABLE_NODES, _TABLE_ANGLES = 97, 24
 """Nodes of the table of 𝒯. The mean over the angle need not be exact: any isotropic weight
 gives a valid null test. It must be smooth in k, which it is for any number of angles."""
 CIRCLES, CIRCLE_POINTS = 25, 24
-"""Of the table of |T|² on circles, and points on half of each."""
+"""Of the table of `|T|²` on circles, and points on half of each."""
 _PSFS_AT_ONCE = 64
 """Bounds the memory of the trigonometric sums."""
 
@@ -49,7 +49,7 @@ class Psf:
     weight : CubicTable
         `𝒯` as a function of `k/kmax`, one table per PSF.
     ln_power : array, shape (n_psf, n_circle, n_point)
-        ln |T|² at `circle_kmax j/(n_circle - 1)`, angles `π (l + ½)/n_point`.
+        `ln |T|²` at `circle_kmax j/(n_circle - 1)`, angles `π (l + ½)/n_point`.
     circle_kmax : array, shape (n_psf,)
         Radius of the outermost circle, rad/pixel: `kmax` as it was made.
     oversampling : float
@@ -266,7 +266,7 @@ def _waves(k: Array, n: int, oversampling: float) -> Array:
 
 
 def _circularise(image: Array, oversampling: float, floor: float) -> tuple[Array, Array, Array]:
-    """Return `kmax`, shape (n_psf,), `𝒯` at the table's nodes, and ln |T|² on circles."""
+    """Return `kmax`, shape (n_psf,), `𝒯` at the table's nodes, and `ln |T|²` on circles."""
     xp = array_namespace(image=image)
     like = {"dtype": image.dtype, "device": device_of(image)}
     scan = xp.linspace(0.0, np.pi, _SCAN_RADII, **like)[None, :]

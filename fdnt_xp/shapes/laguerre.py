@@ -5,7 +5,7 @@ On the plane of `u = (r cos theta, r sin theta)`, for `p >= q >= 0` and `m = p -
     psi_pq = (-1)^q sqrt(q!/(pi p!)) r^m exp(i m theta) exp(-r²/2) L_q^(m)(r²)
 
 and `psi_qp = psi_pq*`: orthonormal, `integral psi_pq* psi_p'q' d²u = 1` or 0. A real image
-has `b_qp = b_pq*`, so `sum b_pq psi_pq` over all p + q <= N is a sum over real functions,
+has `b_qp = b_pq*`, so `sum b_pq psi_pq` over all p + q <= N is a sum over real functions::
 
     phi = psi_pp,                                      coefficient b_pp,
     phi = sqrt(2) Re psi_pq and sqrt(2) Im psi_pq,     coefficients sqrt(2) Re b_pq and
@@ -15,7 +15,7 @@ orthonormal again. They are packed by p + q first, so that a lower order is a be
 higher one; then by m, the cosine before the sine: 00 | 10c 10s | 11 20c 20s | 21c 21s ...
 
 An elliptical basis has `u = S_eta^-1 (x - x0)/sigma` and functions `phi(u)/sigma`, orthonormal
-over x. The transform `integral f(x) exp(-i k.x) d²x` of one is, with `l = sigma S_eta k`,
+over x. The transform `integral f(x) exp(-i k.x) d²x` of one is, with `l = sigma S_eta k`::
 
     2 pi sigma (-i)^(p+q) exp(-i k.x0) phi(l).
 """

@@ -23,8 +23,7 @@ from fdnt_xp.shears.counter_shear import FrameNoise, FrameValues, Statistic, in_
 from fdnt_xp.shears.cuts import QUANTITIES, FrameQuantities
 from fdnt_xp.shears.masks import SampleMask
 
-Gamma: TypeAlias = tuple[float, float]
-"""A trial shear, eta-type."""
+Gamma: TypeAlias = tuple[float, float]  # a trial shear, eta-type
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,6 +10,10 @@ from fdnt_xp.errors import FdntValueError
 from fdnt_xp.shears.frames import Gamma
 
 _MAX_STEPS: Final = 12
+_PATIENT_STEPS: Final = 6
+"""After so many, `_RELAXED` times the tolerance will do: galaxies that are lost in one frame
+and found in the next make the mean of noisy galaxies a function with steps."""
+_RELAXED: Final = 10.0
 
 
 class OutOfReachError(FdntValueError):
@@ -55,12 +59,12 @@ def find_null(
     (a, b), (c, d) = jac
     x, y = start
     f1, f2 = at_start
-    for _ in range(_MAX_STEPS):
+    for step in range(_MAX_STEPS):
         det = a * d - b * c
         if not (math.isfinite(det) and abs(det) > 1e-12 * (a * a + b * b + c * c + d * d)):
             raise FdntValueError("the sample's mean shape does not respond to shear")
         sx, sy = -(d * f1 - b * f2) / det, -(a * f2 - c * f1) / det
-        if math.hypot(sx, sy) < tolerance:
+        if math.hypot(sx, sy) < tolerance * (1.0 if step < _PATIENT_STEPS else _RELAXED):
             return x + sx, y + sy
         x, y = x + sx, y + sy
         if not math.hypot(x, y) <= largest:

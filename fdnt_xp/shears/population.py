@@ -37,7 +37,7 @@ _TOLERANCE_NOISY, _TOLERANCE_HARD = 1e-2, 3e-2
 """The same in noisy data, in standard errors; with a hard cut, where the mean has steps. The
 last step is taken, and what it leaves is smaller by the error of the response, 1e-3."""
 _SLOPE_SEEN: Final = 1e-3
-"""Least step in gamma from which a slope is learnt where hard cuts make the mean rough."""
+"""Least step in gamma from which a slope is learnt, where cuts or noise make the mean rough."""
 _DEFAULT_SHEAR: Final = 0.1
 _PILOT: Final = 20_000
 """Galaxies that find a first shear for a sample of four times as many or more."""
@@ -259,7 +259,7 @@ class _Null:
             start=origin,
             largest=self.largest,
             tolerance=self._tolerance(v, response),
-            least_secant=_SLOPE_SEEN if self.selection.hard else 0.0,
+            least_secant=_SLOPE_SEEN if self.selection.hard or self.sample.noise else 0.0,
         )
         return gamma, v, response
 
