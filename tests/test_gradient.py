@@ -10,8 +10,9 @@ from array_api_extra.testing import assert_close
 from scipy.optimize import root
 
 import fdnt_xp as fx
+from fdnt_xp.fourier.transform import deconvolve
 from fdnt_xp.nulltests.tests import NullTests
-from fdnt_xp.shapes import measure
+from fdnt_xp.shapes.job import check_stamps, prepare
 from images import galaxies, star
 from tolerances import tolerance
 
@@ -57,9 +58,9 @@ def eta_at(shrink, stamps, psf, shapes, monkeypatch):
         factor, slope = self.weight.psf_factor(view.square, s)
         return replace(view, shrink=s, psf_factor=factor, psf_slope=slope)
 
-    xp, stamps = measure.check_stamps(stamps, psf)
-    job = measure.prepare(xp, stamps, psf, 1, None, 50)
-    data = measure.deconvolve(stamps, psf.inverse_transfer(job.coarse), job.coarse)
+    xp, stamps = check_stamps(stamps, psf)
+    job = prepare(xp, stamps, psf, 1, None, 50)
+    data = deconvolve(stamps, psf.inverse_transfer(job.coarse), job.coarse)
     tests = NullTests(grid=job.coarse, galaxies=data, weight=job.weight, length=1.0)
 
     def scaled(x):
