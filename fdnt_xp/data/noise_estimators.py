@@ -29,7 +29,7 @@ from fdnt_xp.shears.responses import measure_responses
 from fdnt_xp.shears.sample import default_size
 
 MAX_SHEAR: Final = 0.1
-"""Of the nulls."""
+"""Of the nulls, unless a batch wants more: for their control that makes no difference."""
 RESPONSE_STEP: Final = 0.01
 _FOR_RESPONSE: Final = 256
 """Galaxies whose mean response scales the control variate."""
@@ -109,7 +109,6 @@ def _null(stamps: NoisyStamps, settings: Settings, **options: Any) -> Found:
             noise_variance=stamps.variance,
             seed=stamps.seed,
             cut=settings.cut,
-            max_shear=MAX_SHEAR,
             padding=settings.padding,
             **numbers,
             **{"softening": settings.softening, **options},
