@@ -22,7 +22,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 from scipy import ndimage
 
-from fdnt_xp.app.ring import write_json
+from fdnt_xp.app.numbers import write_json
 from fdnt_xp.data.noise_control import KnownNoise, second_order
 from fdnt_xp.data.versions import Population, draw_versions
 from fdnt_xp.fourier.missing import fill_missing

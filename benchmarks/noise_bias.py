@@ -24,7 +24,7 @@ import click
 
 from fdnt_xp.app.backends import BACKENDS, DTYPES, load_backend
 from fdnt_xp.app.check import table_header, table_row
-from fdnt_xp.app.ring import write_json
+from fdnt_xp.app.numbers import write_json
 from fdnt_xp.data.noise_bias import NoiseBias, noise_bias
 from fdnt_xp.data.versions import Population, draw_versions
 

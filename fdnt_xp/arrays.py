@@ -77,6 +77,18 @@ def require_dtype(dtype: DType, **arrays: Array | None) -> None:
             )
 
 
+def has_any(flags: Array, bits: int) -> Array:
+    """Return where integers hold at least one of some bits; bool, of the shape of `flags`."""
+    xp = array_namespace(flags=flags)
+    return xp.bitwise_and(flags, xp.full_like(flags, bits)) != 0
+
+
+def count_true(where: Array) -> int:
+    """Return how many elements are true, on the host."""
+    xp = array_namespace(where=where)
+    return int(xp.sum(xp.astype(where, xp.int64)))
+
+
 def as_floating(xp: ModuleType, array: Array, name: str) -> Array:
     """Return `array` as real floating point, in native byte order and positive strides.
 

@@ -12,7 +12,9 @@ from fdnt_xp.arrays import (
     array_namespace,
     as_floating,
     compiles_every_shape,
+    count_true,
     device_of,
+    has_any,
     require_dtype,
     to_numpy,
 )
@@ -134,3 +136,13 @@ def test_the_copy_on_the_host_is_a_copy(xp, to_xp):
 def test_only_jax_compiles_every_shape(backend, to_xp):
     namespace = array_namespace(stamps=to_xp([1.0]))
     assert compiles_every_shape(namespace) is (backend.library == "jax")
+
+
+# --- bits and counts -----------------------------------------------------------------
+
+
+def test_bits_of_flags(xp, to_xp):
+    flags = to_xp(np.array([0, 1, 2, 6, 2**23], dtype=np.int32))
+    assert_equal(has_any(flags, 2 + 2**23), to_xp([False, False, True, True, True]), xp=xp)
+    assert count_true(has_any(flags, 3)) == 3
+    assert count_true(has_any(flags, 8)) == 0

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 
 from fdnt_xp.app.backends import load_backend
+from fdnt_xp.app.numbers import check_json, write_json
 from fdnt_xp.app.plots import (
     BLUE,
     GREEN,
@@ -20,7 +21,7 @@ from fdnt_xp.app.plots import (
     page_style,
     save_figure,
 )
-from fdnt_xp.app.ring import TARGET, check_json, write_json
+from fdnt_xp.app.ring import TARGET
 from fdnt_xp.data.noise_bias import NoiseBias, check_snr, noise_bias
 from fdnt_xp.data.noise_estimators import check_estimators
 from fdnt_xp.data.versions import MIXED_RADII, Population, draw_versions

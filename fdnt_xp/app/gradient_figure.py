@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
 from fdnt_xp.app.backends import load_backend
+from fdnt_xp.app.numbers import check_rows, write_rows
 from fdnt_xp.app.plots import (
     BLUE,
     GREEN,
@@ -21,8 +21,7 @@ from fdnt_xp.app.plots import (
     page_style,
     save_figure,
 )
-from fdnt_xp.app.ring import TARGET, check_json, write_json
-from fdnt_xp.data.catalog import check_catalog, write_catalog
+from fdnt_xp.app.ring import TARGET
 from fdnt_xp.data.profiles import TEST_GALAXIES, gaussian_psf, load_galsim
 from fdnt_xp.data.ring import ESTIMATORS, RingResult, draw, ring_test
 
@@ -79,8 +78,7 @@ def draw_gradient_figure(
     """Run the ring tests, say what comes out, and write the figure and the numbers."""
     check_figure(output, overwrite=overwrite)
     if table is not None:
-        check = check_json if Path(table).suffix.lower() == ".json" else check_catalog
-        check(table, overwrite=overwrite)
+        check_rows(table, overwrite=overwrite)
     say(f"{'galaxy':<12}{'PSF':>4}{'|e|':>8}{'EG':>9}" + "".join(f"{n:>12}" for n in ESTIMATORS))
     rows = measure_gradients(figure, say)
     save_figure(plot_gradients(rows, figure.delta_eta), output, overwrite=overwrite)
@@ -110,16 +108,6 @@ def measure_gradients(figure: GradientFigure, say: Callable[[str], None]) -> lis
             m = "".join(f"{bias.m:>+12.2e}" for bias in result.biases.values())
             say(f"{name:<12}{radius:>4.1f}{result.e:>8.4f}{result.eg:>+9.4f}{m}")
     return rows
-
-
-def write_rows(rows: list[Row], path: str, *, overwrite: bool) -> None:
-    """Write the numbers as JSON, or as a table by the suffix."""
-    if Path(path).suffix.lower() == ".json":
-        write_json(rows, path, overwrite=overwrite)
-        return
-    from astropy.table import Table
-
-    write_catalog(Table(rows=rows), path, overwrite=overwrite)
 
 
 def plot_gradients(rows: list[Row], delta_eta: float) -> Figure:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from fdnt_xp.app.backends import load_backend
+from fdnt_xp.app.numbers import check_json, write_json
 from fdnt_xp.app.plots import (
     BLUE,
     GREEN,
@@ -21,10 +20,9 @@ from fdnt_xp.app.plots import (
     page_style,
     save_figure,
 )
-from fdnt_xp.data.files import check_writable, new_file
 from fdnt_xp.data.profiles import TEST_GALAXIES, gaussian_psf, moffat_psf, sersic
 from fdnt_xp.data.ring import RingResult, ring_test
-from fdnt_xp.errors import CatalogError, FdntValueError
+from fdnt_xp.errors import FdntValueError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -132,19 +130,6 @@ def parse_psf(text: str) -> Any:
     if kind == "gaussian":
         return gaussian_psf(profile[0], (e1, e2))
     return moffat_psf(profile[0], profile[1], (e1, e2))
-
-
-def check_json(path: str, *, overwrite: bool) -> None:
-    """Raise what `write_json` would raise, before there is anything to write."""
-    if Path(path).suffix.lower() != ".json":
-        raise CatalogError(f"the suffix of {path} must be .json")
-    check_writable(path, overwrite=overwrite)
-
-
-def write_json(content: Any, path: str, *, overwrite: bool) -> None:
-    """Write JSON, whole or not at all."""
-    with new_file(path, overwrite=overwrite) as temporary:
-        temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
 def plot_ring(result: RingResult, title: str) -> Figure:

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 import fdnt_xp.peers  # noqa: F401  gives its methods their names
 from fdnt_xp.app.backends import load_backend
+from fdnt_xp.app.numbers import check_rows, write_rows
 from fdnt_xp.app.plots import (
     BLUE,
     GREEN,
@@ -25,9 +25,8 @@ from fdnt_xp.app.plots import (
     page_style,
     save_figure,
 )
-from fdnt_xp.app.ring import TARGET, check_json, write_json
+from fdnt_xp.app.ring import TARGET
 from fdnt_xp.arrays import to_numpy
-from fdnt_xp.data.catalog import check_catalog, write_catalog
 from fdnt_xp.data.profiles import gaussian_psf, load_galsim, sersic
 from fdnt_xp.data.ring import draw
 from fdnt_xp.fourier.psf import Psf
@@ -89,21 +88,13 @@ def draw_underfitting_figure(
     """Measure all galaxies by all methods, say what comes out, write figure and numbers."""
     check_figure(output, overwrite=overwrite)
     if table is not None:
-        check = check_json if Path(table).suffix.lower() == ".json" else check_catalog
-        check(table, overwrite=overwrite)
+        check_rows(table, overwrite=overwrite)
     say(f"{'method':<12}{'PSF':>5}{'n':>5}" + "".join(f"{e:>18}" for e in DISTORTIONS))
     rows = measure_underfitting(figure, say)
     save_figure(plot_underfitting(rows), output, overwrite=overwrite)
     say(f"written    {output}")
     if table is not None:
-        if Path(table).suffix.lower() == ".json":
-            # JSON has no NaN.
-            plain = [{k: None if v != v else v for k, v in row.items()} for row in rows]
-            write_json(plain, table, overwrite=overwrite)
-        else:
-            from astropy.table import Table
-
-            write_catalog(Table(rows=rows), table, overwrite=overwrite)
+        write_rows(rows, table, overwrite=overwrite)
         say(f"written    {table}")
 
 

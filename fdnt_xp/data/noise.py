@@ -9,11 +9,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fdnt_xp.data.noise_power import group_error
+from fdnt_xp.data.noise_power import SIGMA_PER_MAD, group_error
 from fdnt_xp.data.stamps import StampSource
 
-_SIGMA_PER_MAD: Final = 1.482602218505602
-"""Standard deviation of a Gaussian over its median absolute deviation."""
 _MOST_STAMPS: Final = 2000
 """Enough for the variance to a few parts in a thousand, and quick to read."""
 _GROUPS: Final = 50
@@ -98,7 +96,7 @@ def measure_border_noise(source: StampSource) -> BorderNoise:
 
 def _level_and_variance(pixels: NDArray[np.float64]) -> tuple[float, float]:
     level = float(np.median(pixels))
-    return level, float(_SIGMA_PER_MAD * np.median(np.abs(pixels - level))) ** 2
+    return level, float(SIGMA_PER_MAD * np.median(np.abs(pixels - level))) ** 2
 
 
 def _border_pixels(source: StampSource) -> list[NDArray[np.float64]]:

@@ -21,7 +21,8 @@ from scipy.special import gammaincc
 
 from fdnt_xp.errors import FdntValueError, FdntWarning, ShapeMismatchError
 
-_SIGMA_PER_MAD: Final = 1.482602218505602
+SIGMA_PER_MAD: Final = 1.482602218505602
+"""Standard deviation of a Gaussian over its median absolute deviation."""
 _FEWEST: Final = 10
 """Stamps below which neither the outliers nor the power of a mode (32 %) are known."""
 _MOST_GROUPS: Final = 50
@@ -239,7 +240,7 @@ def _is_noise(summaries: NDArray[np.float64]) -> NDArray[np.bool_]:
     if not np.any(useful):
         return useful
     middle = np.median(summaries[useful], axis=0)
-    width = _SIGMA_PER_MAD * np.median(np.abs(summaries[useful] - middle), axis=0)
+    width = SIGMA_PER_MAD * np.median(np.abs(summaries[useful] - middle), axis=0)
     near: NDArray[np.bool_] = np.all(np.abs(summaries - middle) <= _OUTLIER * width, axis=-1)
     return near  # False where NaN
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
-from fdnt_xp.arrays import Array, array_namespace, device_of
+from fdnt_xp.arrays import Array, array_namespace, device_of, has_any
 from fdnt_xp.flags import FAILED, Flag
 from fdnt_xp.fourier.psf import Psf
 from fdnt_xp.nulltests.dogleg import Status
@@ -121,7 +121,7 @@ def shapes_of(
         (Flag.SINGULAR, ~fit.regular),
     ):
         flags = xp.where((flags == 0) & holds, xp.full_like(flags, int(flag)), flags)
-    measured = xp.bitwise_and(flags, xp.full_like(flags, int(FAILED))) == 0
+    measured = ~has_any(flags, int(FAILED))
     if fixed:
         flags = xp.where(measured, flags + int(Flag.SIZE_FIXED), flags)
     known = measured & (fit.flux_variance * noise > 0)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
-from fdnt_xp.arrays import Array, array_namespace, device_of, to_numpy
+from fdnt_xp.arrays import Array, array_namespace, device_of, has_any, to_numpy
 from fdnt_xp.flags import FAILED, Flag
 from fdnt_xp.nulltests.dogleg import Status
 
@@ -122,8 +122,7 @@ class ShapeResult:
     @property
     def measured(self) -> Array:
         """True where the galaxy has a shape, shape (n_gal,), bool."""
-        xp = array_namespace(flags=self.flags)
-        return xp.bitwise_and(self.flags, xp.full_like(self.flags, int(FAILED))) == 0
+        return ~has_any(self.flags, int(FAILED))
 
     def take(self, rows: Array) -> ShapeResult:
         """Return the galaxies with the given row numbers (integer array), in that order."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from fdnt_xp.arrays import Array, array_namespace, device_of
+from fdnt_xp.arrays import Array, array_namespace, device_of, has_any
 from fdnt_xp.flags import FAILED, Flag
 from fdnt_xp.nulltests.dogleg import RootResult, Status, newton_step
 from fdnt_xp.nulltests.gradient import ellipticity_gradient
@@ -146,7 +146,7 @@ def describe_with(
     clear = flags == xp.bitwise_and(flags, xp.full_like(flags, int(Flag.FINE_GRID | Flag.FILLED)))
     for flag, holds in reasons:
         flags = _raised(flags, flag, clear & holds)
-    measured = xp.bitwise_and(flags, xp.full_like(flags, int(FAILED))) == 0
+    measured = ~has_any(flags, int(FAILED))
     information = Flag.SIZE_AT_BOUND if tests.fixed_width is None else Flag.SIZE_FIXED
     informed = matched.at_bound if tests.fixed_width is None else measured
     flags = _raised(flags, information, measured & informed)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TypeAlias
 
-from fdnt_xp.arrays import Array, array_namespace, device_of
+from fdnt_xp.arrays import Array, array_namespace, device_of, has_any
 from fdnt_xp.flags import FAILED, Flag
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.noise import DeconvolvedNoise, PixelNoise, RoundNoise
@@ -228,7 +228,7 @@ class _Optics:
 def _withdrawn(values: FrameValues, flags: Array) -> SampleValues:
     """Return the values with those of unusable galaxies withdrawn."""
     xp = array_namespace(flags=flags)
-    usable = xp.bitwise_and(flags, xp.full_like(flags, int(FAILED))) == 0
+    usable = ~has_any(flags, int(FAILED))
 
     def masked(column: Array) -> Array:
         return xp.where(usable, column, xp.full_like(column, math.nan))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fdnt_xp.arrays import Array, array_namespace, as_floating, require_dtype
+from fdnt_xp.arrays import Array, array_namespace, as_floating, count_true, require_dtype
 from fdnt_xp.errors import FdntTypeError, FdntValueError, ShapeMismatchError
 from fdnt_xp.shear import reduced_shear_from_eta
 from fdnt_xp.shears.cuts import QUANTITIES, CutLike, FrameQuantities, Selection
@@ -66,7 +66,7 @@ def shear_from_responses(
     if galaxy_weight is not None:
         extra = _galaxy_weight(result, galaxy_weight)
         frame_weights = [weight * extra for weight in frame_weights]
-    n_used = int(xp.count_nonzero(frame_weights[0] > 0))
+    n_used = count_true(frame_weights[0] > 0)
     if n_used < 2:
         raise FdntValueError(
             f"{n_used} of {result.n_gal} galaxies are measured"
@@ -92,7 +92,7 @@ def shear_from_responses(
         g=reduced_shear_from_eta(2.0 * g),
         g_err=errors[0],
         n_used=n_used,
-        n_excluded=int(xp.count_nonzero(good)) - n_used,
+        n_excluded=count_true(good) - n_used,
         method="responses",
         g_err_jackknife=errors[1],
         responsivity=float(0.5 * (mean_response[0, 0] + mean_response[1, 1])),

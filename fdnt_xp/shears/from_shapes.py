@@ -12,7 +12,7 @@ import warnings
 from dataclasses import dataclass
 from typing import Final
 
-from fdnt_xp.arrays import Array, array_namespace, as_floating, device_of, require_dtype
+from fdnt_xp.arrays import Array, array_namespace, as_floating, count_true, device_of, require_dtype
 from fdnt_xp.errors import FdntTypeError, FdntValueError, FdntWarning, ShapeMismatchError
 from fdnt_xp.shapes.results import ShapeResult
 from fdnt_xp.shears.estimate import ShearEstimate
@@ -22,7 +22,6 @@ from fdnt_xp.shears.weights import (
     ShapeWeight,
     WeightExpansion,
     as_shape_weight,
-    count_true,
     galaxy_weights,
 )
 

@@ -13,7 +13,7 @@ import warnings
 from dataclasses import dataclass, replace
 from typing import Final
 
-from fdnt_xp.arrays import Array, array_namespace, device_of, to_numpy
+from fdnt_xp.arrays import Array, array_namespace, count_true, device_of, has_any, to_numpy
 from fdnt_xp.errors import FdntValueError, FdntWarning, RangeError
 from fdnt_xp.flags import Flag
 from fdnt_xp.fourier.psf import Psf
@@ -317,16 +317,15 @@ class _Weighed:
 
     @classmethod
     def of(cls, frame: SampleValues, selection: Selection) -> _Weighed:
-        xp = array_namespace(v=frame.v)
         weight = selection.weight(frame.quantities) if selection.cuts else None
         kept = frame.found if weight is None else frame.found & (weight > 0)
         values = frame.v if weight is None else frame.v * weight[:, None]
         return cls(
             values=values,
-            counted=int(xp.count_nonzero(kept)),
-            found=int(xp.count_nonzero(frame.found)),
-            masked=_count(frame.flags, Flag.MASKED),
-            filled=_count(frame.flags, Flag.FILLED),
+            counted=count_true(kept),
+            found=count_true(frame.found),
+            masked=count_true(has_any(frame.flags, int(Flag.MASKED))),
+            filled=count_true(has_any(frame.flags, int(Flag.FILLED))),
             snr=frame.quantities.snr,
         )
 
@@ -340,12 +339,6 @@ class _Weighed:
             raise FdntValueError(
                 f"the cut keeps {self.counted} of {self.found} galaxies; a null needs two"
             )
-
-
-def _count(flags: Array, flag: Flag) -> int:
-    """Return how many galaxies have a flag."""
-    xp = array_namespace(flags=flags)
-    return int(xp.count_nonzero(xp.bitwise_and(flags, xp.full_like(flags, int(flag)))))
 
 
 def _pair(vector: Array) -> tuple[float, float]:

@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Final
 
-from fdnt_xp.arrays import Array, array_namespace, device_of, to_numpy
+from fdnt_xp.arrays import Array, array_namespace, device_of, has_any, to_numpy
 from fdnt_xp.errors import RangeError
 from fdnt_xp.flags import FAILED, Flag
 from fdnt_xp.fourier.psf import Psf
@@ -70,8 +70,7 @@ class ResponseResult:
     @property
     def measured(self) -> Array:
         """True where the galaxy has a response, shape (n_gal,), bool."""
-        xp = array_namespace(flags=self.flags)
-        return xp.bitwise_and(self.flags, xp.full_like(self.flags, int(FAILED))) == 0
+        return ~has_any(self.flags, int(FAILED))
 
     def take(self, rows: Array) -> ResponseResult:
         """Return the galaxies with the given row numbers (integer array), in that order."""
@@ -214,7 +213,7 @@ def measure_responses(
     frames = ((0.0, 0.0), (-eta, 0.0), (eta, 0.0), (0.0, -eta), (0.0, eta))
     seen = sample.evaluate(frames)
     flags = _flags(seen)
-    measured = xp.bitwise_and(flags, xp.full_like(flags, int(FAILED))) == 0
+    measured = ~has_any(flags, int(FAILED))
     slopes = [(seen[1 + 2 * j].v - seen[2 + 2 * j].v) / (2.0 * step) for j in (0, 1)]
 
     def or_nan(column: Array) -> Array:
@@ -244,6 +243,6 @@ def _flags(seen: list[SampleValues]) -> Array:
     flags = seen[0].flags
     xp = array_namespace(flags=flags)
     n_found = sum((xp.astype(one.found, xp.int32) for one in seen), xp.zeros_like(flags))
-    usable = xp.bitwise_and(flags, xp.full_like(flags, int(FAILED))) == 0
+    usable = ~has_any(flags, int(FAILED))
     lost = usable & (n_found < len(seen))
     return flags + xp.astype(lost, xp.int32) * int(Flag.LOST_IN_FRAME)

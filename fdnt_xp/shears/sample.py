@@ -17,6 +17,7 @@ from fdnt_xp.errors import (
 from fdnt_xp.fourier.noise import PixelNoise
 from fdnt_xp.fourier.psf import Psf
 from fdnt_xp.shapes.job import check_count, check_options, check_stamps, galaxies_at_once, prepare
+from fdnt_xp.shapes.pixels import noise_column
 from fdnt_xp.shears.counter_shear import FrozenQuadrupole, SolvedEta, Statistic
 from fdnt_xp.shears.frames import FrameSample, SampleNoise
 from fdnt_xp.shears.masks import Masked, SampleMask
@@ -161,20 +162,7 @@ def _sample_noise(xp: ModuleType, stamps: Array, options: NoiseOptions) -> Sampl
 
 def _variances(xp: ModuleType, stamps: Array, given: float | Array) -> Array | None:
     """Return the variance of each galaxy's pixels, or None where all are 0."""
-    like = stamps[:, 0, 0]
-    if isinstance(given, int | float):
-        if not (math.isfinite(given) and given >= 0):
-            raise RangeError("noise_variance", float(given), 0.0, None)
-        return None if given == 0 else xp.full_like(like, float(given))
-    array_namespace(stamps=stamps, noise_variance=given)
-    given = as_floating(xp, given, "noise_variance")
-    require_dtype(stamps.dtype, noise_variance=given)
-    if given.shape not in ((), like.shape):
-        raise ShapeMismatchError(
-            f"noise_variance must be a number or have the shape {tuple(like.shape)}, "
-            f"not {tuple(given.shape)}"
-        )
-    variance = xp.broadcast_to(given, like.shape)
+    variance = noise_column(xp, given, stamps)
     if not bool(xp.all(xp.isfinite(variance) & (variance >= 0))):
         raise FdntValueError("noise_variance must be finite and not negative, for each galaxy")
     return variance if bool(xp.any(variance > 0)) else None

@@ -15,7 +15,7 @@ from functools import reduce
 from types import ModuleType
 from typing import Final
 
-from fdnt_xp.arrays import Array, array_namespace, as_floating, device_of, require_dtype
+from fdnt_xp.arrays import Array, array_namespace, as_floating, count_true, device_of, require_dtype
 from fdnt_xp.errors import FdntValueError, FdntWarning, ShapeMismatchError
 from fdnt_xp.flags import flag_names
 from fdnt_xp.fourier.psf import Psf
@@ -38,7 +38,7 @@ from fdnt_xp.shapes.results import ShapeResult
 from fdnt_xp.shapes.solution import describe
 from fdnt_xp.shear import reduced_shear_from_eta
 from fdnt_xp.shears.estimate import ShearEstimate
-from fdnt_xp.shears.weights import count_true, galaxy_weights
+from fdnt_xp.shears.weights import galaxy_weights
 
 _MAX_ITER: Final = 50
 _PASSES: Final = 8

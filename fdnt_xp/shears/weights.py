@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import Final, TypeAlias
 
-from fdnt_xp.arrays import Array, array_namespace, as_floating
+from fdnt_xp.arrays import Array, array_namespace, as_floating, count_true
 from fdnt_xp.errors import (
     FdntTypeError,
     FdntValueError,
@@ -272,12 +272,6 @@ def galaxy_weights(usable: Array, galaxy_weight: Array | None) -> Array:
             f"galaxy_weight must be finite and not negative; it is not for {n_bad} galaxies"
         )
     return xp.astype(weights, xp.float64)
-
-
-def count_true(where: Array) -> int:
-    """Return how many elements are true, on the host."""
-    xp = array_namespace(where=where)
-    return int(xp.sum(xp.astype(where, xp.int64)))
 
 
 def _checked_values(name: str, abs_eta: Array, values: Array) -> Array:
