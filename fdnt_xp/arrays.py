@@ -17,6 +17,8 @@ from fdnt_xp.errors import FdntTypeError, NamespaceError
 
 Array: TypeAlias = Any
 """An array of any library that follows the Array API standard."""
+Rows: TypeAlias = "slice | Array"
+"""Some of the rows of an array: a range, or an integer array."""
 Device: TypeAlias = Any
 DType: TypeAlias = Any
 
@@ -87,6 +89,13 @@ def count_true(where: Array) -> int:
     """Return how many elements are true, on the host."""
     xp = array_namespace(where=where)
     return int(xp.sum(xp.astype(where, xp.int64)))
+
+
+def rows_of(array: Array, rows: Rows) -> Array:
+    """Return some rows of an array; a range of them is a view where the library has views."""
+    if isinstance(rows, slice):
+        return array[rows, ...]
+    return array_namespace(rows=rows).take(array, rows, axis=0)
 
 
 def as_floating(xp: ModuleType, array: Array, name: str) -> Array:

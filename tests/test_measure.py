@@ -354,7 +354,7 @@ def test_wrong_rank_is_refused(shape, psf, dtype, to_xp):
 
 def test_another_number_of_psfs_is_refused(stamps, dtype, to_xp):
     psf = fx.Psf.from_image(to_xp(np.stack([star()] * 3), dtype))
-    with pytest.raises(ShapeMismatchError, match="psf holds 3 PSFs for 5 stamps"):
+    with pytest.raises(ShapeMismatchError, match="psf is for 3 galaxies, but there are 5 stamps"):
         fx.measure_shapes(stamps, psf)
 
 

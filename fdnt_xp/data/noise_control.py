@@ -17,15 +17,17 @@ both signs is used: taking it off makes m 5 to 20 times as certain at S/N 15 to 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fdnt_xp.arrays import Rows, rows_of
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.noise import DeconvolvedNoise, PixelNoise, RoundNoise
 from fdnt_xp.fourier.psf import Psf
 from fdnt_xp.fourier.transform import DeconvolvedStamps, deconvolve
+from fdnt_xp.shapes.job import Job, in_order
 from fdnt_xp.shears.counter_shear import FrozenQuadrupole
 from fdnt_xp.shears.frames import FrameSample, Gamma
 from fdnt_xp.shears.sample import NoiseOptions, make_sample
@@ -41,7 +43,7 @@ class KnownNoise:
     ----------
     clean, noise : array, shape (n_gal, ny, nx)
     psf : Psf
-        One for all, or one for each.
+        As `population_null` is given it.
     variance : float
         Of a pixel.
     identifiers, symmetry : array of int64, shape (n_gal,)
@@ -61,6 +63,11 @@ class KnownNoise:
     softening: float = 1.0
     max_shear: float = 0.1
     padding: int = 1
+
+    def take(self, rows: Rows) -> KnownNoise:
+        """Return the given galaxies, their PSFs as they are."""
+        columns = ("clean", "noise", "identifiers", "symmetry")
+        return replace(self, **{name: rows_of(getattr(self, name), rows) for name in columns})
 
 
 def second_order(known: KnownNoise, gamma: Gamma) -> Real:
@@ -91,32 +98,39 @@ def second_order(known: KnownNoise, gamma: Gamma) -> Real:
             symmetry=known.symmetry,
         ),
     )
-    frame = sample.job.coarse.sheared(np.asarray(gamma))
-    signal, noise, weight, power = _in_frame(sample, known, frame, gamma)
-    statistic = sample.statistic
-    assert isinstance(statistic, FrozenQuadrupole)
-    start = np.zeros((len(known.clean), 2))
-    shrunk = sample.job.weight.shrunk(sample.reach)
-    solution = statistic.evaluate(frame, signal, shrunk, start, None).solution
-    moments = _Moments.of(frame, weight, signal, noise, power, statistic.length * solution)
-    return moments.second_order(statistic.softening)
+    chunks = sample.job.chunks(sample.n_gal, sample.chunk_size)
+    parts = [
+        _of_chunk(sample, sample.job.of(chunk), known.take(chunk.rows), gamma) for chunk in chunks
+    ]
+    place = in_order(chunks)
+    return np.concatenate(parts) if place is None else np.concatenate(parts)[place]
 
 
-def _in_frame(
-    sample: FrameSample, known: KnownNoise, frame: KGrid, gamma: Gamma
-) -> tuple[DeconvolvedStamps, DeconvolvedStamps, Real, Real]:
-    """Return galaxies, their noise made round, the weight, and the power of that noise."""
-    grid, psf = sample.job.coarse, sample.job.psf
-    inverse = psf.inverse_transfer(grid)
+def _of_chunk(sample: FrameSample, job: Job, known: KnownNoise, gamma: Gamma) -> Real:
+    """Return the same of galaxies that are in work together."""
+    grid = job.coarse
+    frame = grid.sheared(np.asarray(gamma))
+    inverse = job.psf.inverse_transfer(grid)
+    galaxies = deconvolve(known.clean, inverse, grid)
     variance = np.full(len(known.clean), known.variance)
-    deconvolved = DeconvolvedNoise.behind(psf, PixelNoise(variance=variance), grid, inverse)
+    deconvolved = DeconvolvedNoise.behind(job.psf, PixelNoise(variance=variance), grid, inverse)
     wanted = deconvolved.made_round(frame, gamma, sample.reach)
     synthetic = RoundNoise.draw(known.identifiers, known.seed, variance, grid, known.symmetry)
     noise = synthetic.added_to(deconvolve(known.noise, inverse, grid), wanted - deconvolved.power)
     statistic = sample.statistic
     assert isinstance(statistic, FrozenQuadrupole)
-    weight = sample.job.weight.shrunk(sample.reach).round_window(frame, statistic.size)
-    return deconvolve(known.clean, inverse, grid), noise, weight, known.variance * wanted
+    shrunk = job.weight.shrunk(sample.reach)
+    start = np.zeros((len(known.clean), 2))
+    solution = statistic.evaluate(frame, galaxies, shrunk, start, None).solution
+    moments = _Moments.of(
+        frame,
+        shrunk.round_window(frame, statistic.size),
+        galaxies,
+        noise,
+        known.variance * wanted,
+        statistic.length * solution,
+    )
+    return moments.second_order(statistic.softening)
 
 
 @dataclass(frozen=True, kw_only=True)

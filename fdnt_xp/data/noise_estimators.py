@@ -89,7 +89,7 @@ def arrays_of(stamps: NoisyStamps, settings: Settings) -> tuple[Array, Psf, dict
     xp, device = array_namespace(pixels=pixels), device_of(pixels)
     psf = settings.psf
     if psf.n_psf > 1:
-        psf = psf.take(xp.asarray(stamps.psf_of, device=device))
+        psf = psf.with_index(xp.asarray(stamps.psf_of, device=device))
     numbers = {"identifiers": stamps.identifiers, "noise_symmetry": stamps.symmetry}
     return pixels, psf, {name: xp.asarray(n, device=device) for name, n in numbers.items()}
 
@@ -172,7 +172,7 @@ def _control(
     the product would have a mean.
     """
     psf = settings.host_psf
-    psf = psf if psf.n_psf == 1 else psf.take(stamps.psf_of)
+    psf = psf if psf.n_psf == 1 else psf.with_index(stamps.psf_of)
     known = KnownNoise(
         clean=stamps.clean,
         noise=stamps.pixels - stamps.clean,

@@ -20,7 +20,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fdnt_xp.arrays import Array, array_namespace, device_of
+from fdnt_xp.arrays import Array, Rows, array_namespace, device_of, rows_of
 from fdnt_xp.fourier.deviates import unit_deviates
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.interpolation import cubic_table
@@ -80,12 +80,12 @@ class PixelNoise:
             correlation=xp.roll(lags, (ny // 2, nx // 2), axis=(-2, -1)),
         )
 
-    def rows(self, rows: slice) -> PixelNoise:
-        """Return the noise of a range of galaxies."""
+    def take(self, rows: Rows) -> PixelNoise:
+        """Return the noise of the given galaxies."""
         correlation = self.correlation
         if correlation is not None and int(correlation.shape[0]) > 1:
-            correlation = correlation[rows, :, :]
-        return PixelNoise(variance=self.variance[rows], correlation=correlation)
+            correlation = rows_of(correlation, rows)
+        return PixelNoise(variance=rows_of(self.variance, rows), correlation=correlation)
 
     @property
     def shared(self) -> bool:
@@ -240,7 +240,7 @@ def _ln_polar(psf: Psf, pixels: PixelNoise) -> Array:
     parts = []
     for first in range(0, psf.n_psf, _PSFS_AT_ONCE):
         rows = slice(first, min(first + _PSFS_AT_ONCE, psf.n_psf))
-        correlation = pixels.rows(rows).correlation
+        correlation = pixels.take(rows).correlation
         parts.append(power_on_circles(correlation, radii[rows, :], CIRCLE_POINTS, 1.0))
     power = xp.sqrt(xp.concat(parts))
     # A mode without noise, as k = 0 of an image less its mean, has no logarithm.

@@ -11,12 +11,13 @@ falls below a floor or the grid ends, and it ends smoothly: a hard edge costs 1e
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from types import ModuleType
 
 import numpy as np
 
 from fdnt_xp.arrays import Array, array_namespace, as_floating, device_of
-from fdnt_xp.errors import FdntValueError, RangeError, ShapeMismatchError
+from fdnt_xp.errors import FdntTypeError, FdntValueError, RangeError, ShapeMismatchError
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.interpolation import CubicTable, cubic_table
 from fdnt_xp.fourier.transform import complex_like, half_plane_axes, mode_phase
@@ -34,7 +35,9 @@ _PSFS_AT_ONCE = 64
 
 @dataclass(frozen=True, kw_only=True)
 class Psf:
-    """One PSF for all galaxies, or one for each. Made by `Psf.from_image`.
+    """One PSF for all galaxies, one for each, or several that galaxies share.
+
+    Made by `Psf.from_image`.
 
     Parameters
     ----------
@@ -56,6 +59,8 @@ class Psf:
         Pixels of `image` per pixel of the galaxies, along one axis.
     largest_kmax : float
         The largest `kmax`, on the host.
+    index : array of int64, shape (n_gal,), optional
+        Which PSF each galaxy has, where several share one.
     """
 
     image: Array
@@ -67,18 +72,30 @@ class Psf:
     circle_kmax: Array
     oversampling: float
     largest_kmax: float
+    index: Array | None = None
 
     @classmethod
-    def from_image(cls, image: Array, *, oversampling: float = 1.0, floor: float = 1e-6) -> Psf:
+    def from_image(
+        cls,
+        image: Array,
+        *,
+        psf_index: Array | None = None,
+        oversampling: float = 1.0,
+        floor: float = 1e-6,
+    ) -> Psf:
         """Take the PSF from the image of a star, or from a stack of such images.
 
         Parameters
         ----------
-        image : array, shape (ny, nx) or (n_gal, ny, nx)
-            One star for all galaxies or one for each; pixel response included. Any
-            normalisation with a positive sum, centred anywhere: centroids of galaxies
-            are counted from the flux centroid of the star. The result has its library,
-            dtype and device; integers become float64.
+        image : array, shape (ny, nx), (n_gal, ny, nx) or (n_psf, ny, nx)
+            One star for all galaxies, one for each, or as many as `psf_index` chooses
+            from; pixel response included. Any normalisation with a positive sum, centred
+            anywhere: centroids of galaxies are counted from the flux centroid of the star.
+            The result has its library, dtype and device; integers become float64.
+        psf_index : array of integers, shape (n_gal,), optional
+            Which star each galaxy has, from 0. Tables are made once for each star, and
+            galaxies that share one are measured together: they cost little more than
+            with one PSF for all.
         oversampling : float
             Pixels of `image` per pixel of the galaxies, along one axis. The pixel response
             in the image must be that of the galaxies' pixels.
@@ -91,9 +108,12 @@ class Psf:
             If `image` has another rank, or an axis of length 0.
         RangeError
             If `oversampling` or `floor` is out of range.
+        FdntTypeError, NamespaceError
+            If `psf_index` does not hold whole numbers, or is of another library or device.
         FdntValueError
-            If a single image is not finite or has no positive sum. In a stack such an
-            image is marked instead, and its galaxy flagged `BAD_PSF`.
+            If `psf_index` names a star that there is not, or a single image is not finite or
+            has no positive sum. In a stack such an image is marked instead, and its galaxies
+            flagged `BAD_PSF`.
         """
         xp = array_namespace(image=image)
         image = as_floating(xp, image, "image")
@@ -107,6 +127,7 @@ class Psf:
             raise RangeError("oversampling", oversampling, 0.0, None)
         single = image.ndim == 2
         image = image[None, ...] if single else image
+        index = None if psf_index is None else _checked_index(xp, image, psf_index)
         image, usable = _normalised(image)
         if single and not bool(xp.all(usable)):
             raise FdntValueError("image must be finite, with a positive sum, to serve as the PSF")
@@ -130,20 +151,38 @@ class Psf:
             oversampling=float(oversampling),
             # In float32 pi is rounded up, past the Nyquist modes.
             largest_kmax=min(float(xp.max(kmax)), np.pi) if n_psf else np.pi,
+            index=index,
         )
 
     @property
     def n_psf(self) -> int:
-        """Number of PSFs: 1 for all galaxies, or one for each."""
+        """Number of different PSFs."""
         return int(self.image.shape[0])
 
-    def take(self, rows: Array) -> Psf:
-        """Return the PSFs with the given row numbers (integer array), in that order."""
+    @property
+    def n_gal(self) -> int | None:
+        """Number of galaxies that it is for; None if it is one PSF for any number."""
+        if self.index is not None:
+            return int(self.index.shape[0])
+        return None if self.n_psf == 1 else self.n_psf
+
+    def numbers_of(self, rows: Array) -> Array:
+        """Return which PSF each of the given galaxies (integer array) has."""
         xp = array_namespace(image=self.image, rows=rows)
+        return rows if self.index is None else xp.take(self.index, rows, axis=0)
+
+    def take(self, rows: Array) -> Psf:
+        """Return the PSFs of the given galaxies (integer array), one for each."""
+        xp = array_namespace(image=self.image, rows=rows)
+        numbers = self.numbers_of(rows)
         moved = ("image", "centre", "kmax", "usable", "ln_power", "circle_kmax")
-        kept = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in moved}
-        taken = {name: xp.take(getattr(self, name), rows, axis=0) for name in moved}
-        return Psf(**(kept | taken | {"weight": self.weight.take(rows)}))
+        taken = {name: xp.take(getattr(self, name), numbers, axis=0) for name in moved}
+        return replace(self, **taken, weight=self.weight.take(numbers), index=None)
+
+    def with_index(self, psf_index: Array) -> Psf:
+        """Return the same PSFs for other galaxies: see `from_image`."""
+        xp = array_namespace(image=self.image)
+        return replace(self, index=_checked_index(xp, self.image, psf_index))
 
     def restricted(self, least_kmax: float) -> Psf:
         """Return the PSFs with those marked unusable whose weight ends before `least_kmax`."""
@@ -226,6 +265,25 @@ def half_plane_transform(image: Array, grid: KGrid, oversampling: float) -> Arra
     image = xp.astype(image, along_x.dtype)
     half_plane = xp.matmul(xp.matmul(along_y, image), xp.matrix_transpose(along_x))
     return xp.reshape(half_plane, (n_psf, grid.n_half_plane))
+
+
+def _checked_index(xp: ModuleType, image: Array, psf_index: Array) -> Array:
+    """Return which star each galaxy has as int64; refuse what is no such thing."""
+    array_namespace(image=image, psf_index=psf_index)
+    if not xp.isdtype(psf_index.dtype, "integral"):
+        raise FdntTypeError(f"psf_index must hold whole numbers, but has dtype {psf_index.dtype}")
+    if psf_index.ndim != 1:
+        raise ShapeMismatchError(
+            f"psf_index must have the shape (n_gal,), not {tuple(psf_index.shape)}"
+        )
+    n_psf = int(image.shape[0])
+    index = xp.astype(psf_index, xp.int64)
+    if int(index.shape[0]) and not bool(xp.all((index >= 0) & (index < n_psf))):
+        raise FdntValueError(
+            f"psf_index must be from 0 to {n_psf - 1}, for there are {n_psf} stars; it goes "
+            f"from {int(xp.min(index))} to {int(xp.max(index))}"
+        )
+    return index
 
 
 def _normalised(image: Array) -> tuple[Array, Array]:

@@ -35,11 +35,38 @@ _NARROWEST: Final = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
-class Weight:
-    """The weight for one PSF, or for one PSF per galaxy.
+class WidthTable:
+    """The size equation of each PSF, inverted.
 
     Widths are squares of sizes, `width = sigma²`, in pixel²: the size equation is nearly
     linear in them, and regular where the galaxy is too small to have a size.
+
+    Parameters
+    ----------
+    part : CubicTable
+        `kmax² sigma²` over the table's range, as a function of where `kmax²/<k²>` is in its
+        range (both mapped to [0, 1]), for s = 1.
+    width_range, square_range : array, shape (n_psf, 2)
+        The ranges of `kmax² sigma²` and `kmax²/<k²>`.
+    """
+
+    part: CubicTable
+    width_range: Array
+    square_range: Array
+
+    def take(self, rows: Array) -> WidthTable:
+        """Return the tables with the given row numbers (integer array)."""
+        xp = array_namespace(rows=rows)
+        return WidthTable(
+            part=self.part.take(rows),
+            width_range=xp.take(self.width_range, rows, axis=0),
+            square_range=xp.take(self.square_range, rows, axis=0),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Weight:
+    """The weight for one PSF, or for one PSF per galaxy.
 
     Parameters
     ----------
@@ -47,30 +74,23 @@ class Weight:
         `𝒯` as a function of `k/kmax`.
     kmax : array, shape (n_psf,)
         Where `𝒯` ends, rad/pixel.
-    width_part : CubicTable
-        `kmax² sigma²` over the table's range, as a function of where `kmax²/<k²>` is in its
-        range (both mapped to [0, 1]), for s = 1.
-    width_range, square_range : array, shape (n_psf, 2)
-        The ranges of `kmax² sigma²` and `kmax²/<k²>`.
+    widths : WidthTable, optional
+        What `matched_width` needs.
     """
 
     psf_part: CubicTable
     kmax: Array
-    width_part: CubicTable
-    width_range: Array
-    square_range: Array
+    widths: WidthTable | None = None
 
     def take(self, rows: Array) -> Weight:
-        """Return the weights of the given galaxies; a shared one stays as it is."""
+        """Return the weights with the given row numbers (integer array); a shared one stays."""
         xp = array_namespace(kmax=self.kmax)
         if self.shared:
             return self
         return Weight(
             psf_part=self.psf_part.take(rows),
             kmax=xp.take(self.kmax, rows, axis=0),
-            width_part=self.width_part.take(rows),
-            width_range=xp.take(self.width_range, rows, axis=0),
-            square_range=xp.take(self.square_range, rows, axis=0),
+            widths=None if self.widths is None else self.widths.take(rows),
         )
 
     def shrunk(self, factor: float) -> Weight:
@@ -142,15 +162,17 @@ class Weight:
         at_bound : array, shape (n_gal,), bool
             Where the equation asks for a width beyond the range.
         """
+        assert self.widths is not None  # its maker was told that sizes are matched
         xp = array_namespace(inverse_square=inverse_square)
         # In units where the disc of the sheared weight has radius 1: k = s|k'|/kmax.
         unit = (self.kmax / shrink) ** 2
-        low, high = self.square_range[:, 0], self.square_range[:, 1]
+        square_range, width_range = self.widths.square_range, self.widths.width_range
+        low, high = square_range[:, 0], square_range[:, 1]
         position = (inverse_square * unit - low) / (high - low)
         at_bound = (position <= 0) | (position >= 1)
         inside = xp.minimum(xp.maximum(position, xp.zeros_like(unit)), xp.ones_like(unit))
-        value, slope = self.width_part.evaluate(inside, self._rows(int(unit.shape[0])))
-        narrow, wide = self.width_range[:, 0], self.width_range[:, 1]
+        value, slope = self.widths.part.evaluate(inside, self._rows(int(unit.shape[0])))
+        narrow, wide = width_range[:, 0], width_range[:, 1]
         width = (narrow + value * (wide - narrow)) / unit
         slope = slope * (wide - narrow) / (high - low)
         return width, xp.where(at_bound, xp.zeros_like(slope), slope), at_bound
@@ -163,8 +185,21 @@ class Weight:
         return xp.arange(n_gal, dtype=xp.int64, device=device_of(self.kmax))
 
 
-def make_weight(psf: Psf, largest_size: float) -> Weight:
-    """Tabulate the weight of each PSF, for sizes up to `largest_size` pixels."""
+def make_weight(psf: Psf, largest_size: float | None = None) -> Weight:
+    """Return the weight of each PSF.
+
+    Parameters
+    ----------
+    psf : Psf
+    largest_size : float, optional
+        Largest sigma, pixels, to which the size can be matched. Not at all by default.
+    """
+    widths = None if largest_size is None else _width_table(psf, largest_size)
+    return Weight(psf_part=psf.weight, kmax=psf.kmax, widths=widths)
+
+
+def _width_table(psf: Psf, largest_size: float) -> WidthTable:
+    """Invert the size equation of each PSF."""
     xp = array_namespace(kmax=psf.kmax)
     like = {"dtype": psf.kmax.dtype, "device": device_of(psf.kmax)}
     nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE)
@@ -185,13 +220,7 @@ def make_weight(psf: Psf, largest_size: float) -> Weight:
         square, slope = _inverse_mean_square(measure, t, width)
         width = xp.maximum(width + (wanted - square) / slope, xp.zeros_like(width))
     relative = (width - ends[:, 0:1]) / (ends[:, 1:2] - ends[:, 0:1])
-    return Weight(
-        psf_part=psf.weight,
-        kmax=psf.kmax,
-        width_part=cubic_table(relative),
-        width_range=ends,
-        square_range=square_ends,
-    )
+    return WidthTable(part=cubic_table(relative), width_range=ends, square_range=square_ends)
 
 
 def _inverse_mean_square(measure: Array, t: Array, width: Array) -> tuple[Array, Array]:

@@ -7,7 +7,17 @@ from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Final
 
-from fdnt_xp.arrays import Array, array_namespace, as_floating, device_of, require_dtype
+import numpy as np
+
+from fdnt_xp.arrays import (
+    Array,
+    Rows,
+    array_namespace,
+    as_floating,
+    device_of,
+    require_dtype,
+    to_numpy,
+)
 from fdnt_xp.errors import FdntTypeError, FdntValueError, RangeError, ShapeMismatchError
 from fdnt_xp.flags import Flag
 from fdnt_xp.fourier.grid import KGrid, half_plane_disc
@@ -18,6 +28,8 @@ FINER: Final = 2
 """How much finer the grid for elongated galaxies is, along each axis."""
 _FEWEST_CELLS: Final = 3.0
 """Least radius of the disc, in cells of the k grid: quadrupoles need an annulus or two."""
+_FEWEST_ON_A_PSF: Final = 32
+"""Galaxies for each PSF, in the mean, from which those that share one are taken together."""
 _BYTES_AT_ONCE: Final = 128e6
 """Memory of a chunk of galaxies."""
 _FIELDS: Final = 24
@@ -25,8 +37,24 @@ _FIELDS: Final = 24
 
 
 @dataclass(frozen=True, kw_only=True)
+class Chunk:
+    """Galaxies that are in work together.
+
+    Parameters
+    ----------
+    rows : slice or array of int64
+        Which.
+    psf_number : int, optional
+        The PSF that they share, where others have others.
+    """
+
+    rows: Rows
+    psf_number: int | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class Job:
-    """What all galaxies of a call share, and the PSF, of which there may be one for each.
+    """What the galaxies of a call share, and their PSFs: one, one for each, or some.
 
     Parameters
     ----------
@@ -51,19 +79,60 @@ class Job:
     size: float | None
     max_iter: int
 
-    def rows(self, rows: slice) -> Job:
-        """Return the job of a range of galaxies."""
-        if self.weight.shared:
-            return self
-        xp = array_namespace(kmax=self.psf.kmax)
-        device = device_of(self.psf.kmax)
-        return self.take(xp.arange(rows.start, rows.stop, dtype=xp.int64, device=device))
+    def chunks(self, n_gal: int, n_chunk: int) -> list[Chunk]:
+        """Return all galaxies in parts of at most `n_chunk`: by their PSF if many share one.
 
-    def take(self, rows: Array) -> Job:
-        """Return the job of the given galaxies (integer array)."""
+        An empty sample still has its one chunk, of no rows.
+        """
+        index = self.psf.index
+        if index is None or self.weight.shared or n_gal < _FEWEST_ON_A_PSF * self.psf.n_psf:
+            firsts = range(0, max(n_gal, 1), n_chunk)
+            return [Chunk(rows=slice(first, min(first + n_chunk, n_gal))) for first in firsts]
+        xp = array_namespace(index=index)
+        order = xp.argsort(index, stable=True)
+        numbers = to_numpy(index)
+        ends = np.cumsum(np.bincount(numbers, minlength=self.psf.n_psf))
+        chunks, first = [], 0
+        for number, end in enumerate(int(end) for end in ends):
+            for start in range(first, end, n_chunk):
+                rows = order[start : min(start + n_chunk, end)]
+                chunks.append(Chunk(rows=rows, psf_number=number))
+            first = end
+        return chunks
+
+    def of(self, chunk: Chunk) -> Job:
+        """Return the job of a chunk: one PSF for all of it, or one for each galaxy."""
+        if chunk.psf_number is None:
+            return self.take(chunk.rows)
+        xp = array_namespace(kmax=self.psf.kmax)
+        number = xp.asarray([chunk.psf_number], dtype=xp.int64, device=device_of(self.psf.kmax))
+        psf = replace(self.psf, index=None).take(number)
+        return replace(self, psf=psf, weight=self.weight.take(number))
+
+    def first(self, n_gal: int) -> Job:
+        """Return the job of the first galaxies."""
+        if self.psf.index is None:
+            return self.take(slice(0, n_gal))
+        return replace(self, psf=replace(self.psf, index=self.psf.index[:n_gal]))
+
+    def take(self, rows: Rows) -> Job:
+        """Return the job of the given galaxies, with a PSF for each where there are several."""
         if self.weight.shared:
             return self
-        return replace(self, psf=self.psf.take(rows), weight=self.weight.take(rows))
+        if isinstance(rows, slice):
+            xp = array_namespace(kmax=self.psf.kmax)
+            device = device_of(self.psf.kmax)
+            rows = xp.arange(rows.start, rows.stop, dtype=xp.int64, device=device)
+        numbers = self.psf.numbers_of(rows)
+        return replace(self, psf=self.psf.take(rows), weight=self.weight.take(numbers))
+
+
+def in_order(chunks: list[Chunk]) -> Array | None:
+    """Return where each galaxy is in what chunk after chunk gave; None if in its place."""
+    if isinstance(chunks[0].rows, slice):
+        return None
+    xp = array_namespace(rows=chunks[0].rows)
+    return xp.argsort(xp.concat([chunk.rows for chunk in chunks]))
 
 
 def check_stamps(stamps: Array, psf: Psf) -> tuple[ModuleType, Array]:
@@ -80,9 +149,10 @@ def check_stamps(stamps: Array, psf: Psf) -> tuple[ModuleType, Array]:
             f"stamps must have the shape (n_gal, ny, nx), not {tuple(stamps.shape)}"
         )
     n_gal = int(stamps.shape[0])
-    if psf.n_psf not in (1, n_gal):
+    if psf.n_gal not in (None, n_gal):
         raise ShapeMismatchError(
-            f"psf holds {psf.n_psf} PSFs for {n_gal} stamps; it must hold one, or one for each"
+            f"psf is for {psf.n_gal} galaxies, but there are {n_gal} stamps; it must hold one "
+            "PSF, one for each stamp, or have a psf_index for each"
         )
     return xp, stamps
 
@@ -103,9 +173,16 @@ def check_count(name: str, value: int, least: int) -> None:
 
 
 def prepare(
-    xp: ModuleType, stamps: Array, psf: Psf, padding: int, size: float | None, max_iter: int
+    xp: ModuleType,
+    stamps: Array,
+    psf: Psf,
+    *,
+    padding: int,
+    size: float | None = None,
+    matched: bool = True,
+    max_iter: int = 0,
 ) -> Job:
-    """Make the k grids and the tables of the weight."""
+    """Make the k grids and the tables of the weight; `matched` if its size may be the galaxy's."""
     ny, nx = (int(n) for n in stamps.shape[1:])
     shape = (padding * ny, padding * nx)
     cell = 2.0 * math.pi / min(ny, nx)
@@ -119,7 +196,7 @@ def prepare(
     return Job(
         psf=psf.restricted(_FEWEST_CELLS * cell),
         # A weight of this size is one cell of the k grid wide.
-        weight=make_weight(psf, largest_size=1.0 / cell),
+        weight=make_weight(psf, largest_size=1.0 / cell if matched else None),
         coarse=half_plane_disc(xp, shape, psf.largest_kmax, **like),
         fine=half_plane_disc(xp, (FINER * shape[0], FINER * shape[1]), psf.largest_kmax, **like),
         length=3.0 / psf.largest_kmax,

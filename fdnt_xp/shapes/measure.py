@@ -30,6 +30,7 @@ from fdnt_xp.shapes.job import (
     check_options,
     check_stamps,
     galaxies_at_once,
+    in_order,
     prepare,
 )
 from fdnt_xp.shapes.laguerre import check_order, n_coefficients
@@ -146,13 +147,14 @@ def measure_shapes(
     if n_gal == 0:
         return ShapeResult.unmeasured(stamps)
 
-    job = prepare(xp, stamps, psf, padding, size, max_iter)
+    job = prepare(xp, stamps, psf, padding=padding, size=size, max_iter=max_iter)
     n_chunk = chunk_size or _galaxies_at_once(job, pixels, transform, order)
-    parts = []
-    for start in range(0, n_gal, n_chunk):
-        rows = slice(start, min(start + n_chunk, n_gal))
-        parts.append(_measure_chunk(job.rows(rows), pixels.rows(rows), transform, order))
-    return ShapeResult.concat(parts)
+    chunks = job.chunks(n_gal, n_chunk)
+    result = ShapeResult.concat(
+        [_measure_chunk(job.of(part), pixels.take(part.rows), transform, order) for part in chunks]
+    )
+    place = in_order(chunks)
+    return result if place is None else result.take(place)
 
 
 def _measure_chunk(job: Job, pixels: Pixels, transform: Transform, order: int) -> ShapeResult:

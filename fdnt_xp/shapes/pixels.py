@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, replace
 from types import ModuleType
 
-from fdnt_xp.arrays import Array, array_namespace, as_floating, require_dtype
+from fdnt_xp.arrays import Array, Rows, array_namespace, as_floating, require_dtype, rows_of
 from fdnt_xp.errors import FdntValueError, RangeError, ShapeMismatchError
 from fdnt_xp.flags import Flag
 from fdnt_xp.fourier.psf import Psf
@@ -35,21 +35,12 @@ class Pixels:
         """(ny, nx)."""
         return int(self.stamps.shape[1]), int(self.stamps.shape[2])
 
-    def rows(self, rows: slice) -> Pixels:
-        """Return a range of galaxies."""
+    def take(self, rows: Rows) -> Pixels:
+        """Return the given galaxies."""
         return Pixels(
-            stamps=self.stamps[rows, :, :],
-            variance=self.variance[rows],
-            ivar=None if self.ivar is None else self.ivar[rows, :, :],
-        )
-
-    def take(self, rows: Array) -> Pixels:
-        """Return the given galaxies (integer array)."""
-        xp = array_namespace(rows=rows)
-        return Pixels(
-            stamps=xp.take(self.stamps, rows, axis=0),
-            variance=xp.take(self.variance, rows, axis=0),
-            ivar=None if self.ivar is None else xp.take(self.ivar, rows, axis=0),
+            stamps=rows_of(self.stamps, rows),
+            variance=rows_of(self.variance, rows),
+            ivar=None if self.ivar is None else rows_of(self.ivar, rows),
         )
 
     def kept(self, keep: Array) -> Pixels:

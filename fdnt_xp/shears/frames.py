@@ -12,13 +12,13 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TypeAlias
 
-from fdnt_xp.arrays import Array, array_namespace, device_of, has_any
+from fdnt_xp.arrays import Array, Rows, array_namespace, device_of, has_any, rows_of
 from fdnt_xp.flags import FAILED, Flag
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.noise import DeconvolvedNoise, PixelNoise, RoundNoise
 from fdnt_xp.fourier.transform import DeconvolvedStamps, deconvolve
 from fdnt_xp.shapes.centroid import starting_centroid, wide_weight
-from fdnt_xp.shapes.job import Job, screen
+from fdnt_xp.shapes.job import Chunk, Job, in_order, screen
 from fdnt_xp.shears.counter_shear import FrameNoise, FrameValues, Statistic, in_new_frame
 from fdnt_xp.shears.cuts import QUANTITIES, FrameQuantities
 from fdnt_xp.shears.masks import SampleMask
@@ -56,14 +56,13 @@ class SampleNoise:
             self.identifiers, self.seed, self.pixels.variance, grid, self.symmetry
         )
 
-    def rows(self, rows: slice) -> SampleNoise:
-        """Return the noise of a range of galaxies."""
-        return SampleNoise(
-            pixels=self.pixels.rows(rows),
-            isotropise=self.isotropise,
-            identifiers=self.identifiers[rows],
-            seed=self.seed,
-            symmetry=None if self.symmetry is None else self.symmetry[rows],
+    def take(self, rows: Rows) -> SampleNoise:
+        """Return the noise of the given galaxies."""
+        return replace(
+            self,
+            pixels=self.pixels.take(rows),
+            identifiers=rows_of(self.identifiers, rows),
+            symmetry=None if self.symmetry is None else rows_of(self.symmetry, rows),
         )
 
 
@@ -105,24 +104,27 @@ class FrameSample:
     noise: SampleNoise | None = None
     mask: SampleMask | None = None
     _solutions: dict[int, tuple[Gamma, Array]] = field(default_factory=dict)
-    """Of each chunk, by its first row: the last frame and the unknowns that were solved there,
+    """Of each chunk, by its number: the last frame and the unknowns that were solved there,
     the start of the next."""
+    _optics: dict[int | None, _Optics] = field(default_factory=dict)
+    """Of PSFs that galaxies share, by their number; None for the only one."""
 
     @property
     def n_gal(self) -> int:
         """Number of galaxies."""
         return int(self.stamps.shape[0])
 
-    def rows(self, rows: slice) -> FrameSample:
-        """Return a range of the galaxies as a sample of its own."""
+    def first(self, n_gal: int) -> FrameSample:
+        """Return the first galaxies as a sample of its own."""
+        rows = slice(0, n_gal)
         return FrameSample(
             stamps=self.stamps[rows, :, :],
-            job=self.job.rows(rows),
+            job=self.job.first(n_gal),
             statistic=self.statistic,
             reach=self.reach,
             chunk_size=self.chunk_size,
-            noise=None if self.noise is None else self.noise.rows(rows),
-            mask=None if self.mask is None else self.mask.rows(rows),
+            noise=None if self.noise is None else self.noise.take(rows),
+            mask=None if self.mask is None else self.mask.take(rows),
         )
 
     def told_of_noise(self, factor: float) -> FrameSample:
@@ -130,29 +132,33 @@ class FrameSample:
         if self.noise is None:
             return self
         noise = replace(self.noise, pixels=self.noise.pixels.scaled(factor))
-        return replace(self, noise=noise, _solutions=dict(self._solutions))
+        return replace(self, noise=noise, _solutions=dict(self._solutions), _optics={})
 
     def evaluate(self, gammas: Sequence[Gamma]) -> list[SampleValues]:
         """Return the statistic of all galaxies in each frame."""
         parts: list[list[SampleValues]] = [[] for _ in gammas]
-        # An empty sample still has its one chunk, of no rows.
-        for first in range(0, max(self.n_gal, 1), self.chunk_size):
-            rows = slice(first, min(first + self.chunk_size, self.n_gal))
-            for of_frame, values in zip(parts, self._evaluate_chunk(rows, gammas), strict=True):
+        for number in range(len(self._chunks)):
+            for of_frame, values in zip(parts, self._evaluate_chunk(number, gammas), strict=True):
                 of_frame.append(values)
-        return [_joined(of_frame) for of_frame in parts]
+        place = in_order(self._chunks)
+        return [_joined(of_frame, place) for of_frame in parts]
 
-    def _evaluate_chunk(self, rows: slice, gammas: Sequence[Gamma]) -> Iterator[SampleValues]:
+    @cached_property
+    def _chunks(self) -> list[Chunk]:
+        return self.job.chunks(self.n_gal, self.chunk_size)
+
+    def _evaluate_chunk(self, number: int, gammas: Sequence[Gamma]) -> Iterator[SampleValues]:
         xp = array_namespace(stamps=self.stamps)
-        job = self.job.rows(rows)
+        chunk = self._chunks[number]
+        job = self.job.of(chunk)
         grid = job.coarse
         like = {"dtype": self.stamps.dtype, "device": device_of(self.stamps)}
-        noise = None if self.noise is None else self.noise.rows(rows)
-        stamps, flags = self._screened(rows)
-        optics = self._shared_optics or _Optics.of(job, noise)
+        noise = None if self.noise is None else self.noise.take(chunk.rows)
+        stamps, flags = self._screened(chunk, job)
+        optics = self._optics_of(chunk, job, noise)
         galaxies = deconvolve(stamps, optics.inverse_transfer, grid)
         synthetic = None if noise is None else noise.draw(grid)
-        frame, start = self._solutions.get(rows.start) or ((0.0, 0.0), self._start(job, galaxies))
+        frame, start = self._solutions.get(number) or ((0.0, 0.0), self._start(job, galaxies))
         weight = job.weight.shrunk(self.reach)
         for gamma in gammas:
             sheared = grid.sheared(xp.asarray(gamma, **like))
@@ -167,9 +173,9 @@ class FrameSample:
             values = self.statistic.evaluate(sheared, seen, weight, start, frame_noise)
             frame, start = gamma, values.solution
             yield _withdrawn(values, flags)
-        self._solutions[rows.start] = (frame, start)
+        self._solutions[number] = (frame, start)
 
-    def _screened(self, rows: slice) -> tuple[Array, Array]:
+    def _screened(self, chunk: Chunk, job: Job) -> tuple[Array, Array]:
         """Return stamps that do no harm, their gaps filled, and what is to be said of them.
 
         Returns
@@ -178,23 +184,23 @@ class FrameSample:
         flags : array, shape (n_gal,), int32
             Bits of `Flag`; with one of `FAILED` the galaxy cannot be measured.
         """
-        psf = self.job.rows(rows).psf
-        stamps = self.stamps[rows, :, :]
+        stamps = rows_of(self.stamps, chunk.rows)
         if self.mask is None:
-            return screen(stamps, psf)
+            return screen(stamps, job.psf)
         xp = array_namespace(stamps=stamps)
-        stamps, dropped, filled = self.mask.rows(rows).applied(stamps, psf)
-        stamps, flags = screen(stamps, psf)
+        stamps, dropped, filled = self.mask.take(chunk.rows).applied(stamps, job.psf)
+        stamps, flags = screen(stamps, job.psf)
         for reason, holds in ((Flag.MASKED, dropped), (Flag.FILLED, filled)):
             flags = flags + xp.astype(holds, xp.int32) * int(reason)
         return stamps, flags
 
-    @cached_property
-    def _shared_optics(self) -> _Optics | None:
-        """What all galaxies share, if they do."""
-        if self.job.weight.shared and (self.noise is None or self.noise.pixels.shared):
-            return _Optics.of(self.job, self.noise)
-        return None
+    def _optics_of(self, chunk: Chunk, job: Job, noise: SampleNoise | None) -> _Optics:
+        """Return what galaxies of a chunk share, made once for each PSF that many share."""
+        if not job.weight.shared or not (noise is None or noise.pixels.shared):
+            return _Optics.of(job, noise)
+        if chunk.psf_number not in self._optics:
+            self._optics[chunk.psf_number] = _Optics.of(job, noise)
+        return self._optics[chunk.psf_number]
 
     def _start(self, job: Job, galaxies: DeconvolvedStamps) -> Array:
         """Return a first guess in the frame of the image."""
@@ -243,14 +249,19 @@ def _withdrawn(values: FrameValues, flags: Array) -> SampleValues:
     )
 
 
-def _joined(parts: list[SampleValues]) -> SampleValues:
+def _joined(parts: list[SampleValues], place: Array | None) -> SampleValues:
+    """Return the values of all chunks, in the order of the galaxies."""
     xp = array_namespace(v=parts[0].v)
 
+    def whole(columns: list[Array]) -> Array:
+        joined = xp.concat(columns, axis=0)
+        return joined if place is None else xp.take(joined, place, axis=0)
+
     def column(name: str) -> Array:
-        return xp.concat([getattr(part, name) for part in parts], axis=0)
+        return whole([getattr(part, name) for part in parts])
 
     quantities = {
-        name: xp.concat([getattr(part.quantities, name) for part in parts]) for name in QUANTITIES
+        name: whole([getattr(part.quantities, name) for part in parts]) for name in QUANTITIES
     }
     return SampleValues(
         v=column("v"),

@@ -7,11 +7,11 @@ galaxies. To fill the holes is nearly so, if they are small (docs, "Missing pixe
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Final, Literal, TypeAlias
 
-from fdnt_xp.arrays import Array, array_namespace, device_of
+from fdnt_xp.arrays import Array, Rows, array_namespace, device_of, rows_of
 from fdnt_xp.errors import FdntTypeError, FdntValueError, ShapeMismatchError
 from fdnt_xp.fourier.missing import fill_missing
 from fdnt_xp.fourier.psf import Psf
@@ -72,9 +72,9 @@ class SampleMask:
             )
         return cls(missing=mask, fill=masked == "fill", size=size)
 
-    def rows(self, rows: slice) -> SampleMask:
-        """Return the mask of a range of galaxies."""
-        return SampleMask(missing=self.missing[rows, :, :], fill=self.fill, size=self.size)
+    def take(self, rows: Rows) -> SampleMask:
+        """Return the mask of the given galaxies."""
+        return replace(self, missing=rows_of(self.missing, rows))
 
     def applied(self, stamps: Array, psf: Psf) -> tuple[Array, Array, Array]:
         """Return stamps without gaps, and which are left out and which were filled.

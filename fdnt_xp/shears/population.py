@@ -216,7 +216,7 @@ class _Null:
         xp = array_namespace(stamps=sample.stamps)
         origin = (0.0, 0.0)
         if sample.n_gal >= 4 * _PILOT:
-            pilot = replace(self, sample=sample.rows(slice(0, _PILOT)))
+            pilot = replace(self, sample=sample.first(_PILOT))
             origin, _, _ = pilot.find(origin)
         gamma, v, response = self.find(origin)
         counted, total = v.counted, v.values.shape[0]

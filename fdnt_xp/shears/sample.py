@@ -84,7 +84,8 @@ def make_sample(
         raise RangeError("softening", softening, 0.0, None)
     sample_noise = _sample_noise(xp, stamps, noise)
     noisy = sample_noise is not None
-    job = prepare(xp, stamps, psf.ending_at(_NOISY_FLOOR) if noisy else psf, padding, size, 0)
+    seen_by = psf.ending_at(_NOISY_FLOOR) if noisy else psf
+    job = prepare(xp, stamps, seen_by, padding=padding, matched=statistic == "eta" and not noisy)
     frozen_size = default_size(psf) if size is None else size
     chosen: Statistic
     if statistic == "frozen":

@@ -9,13 +9,21 @@ is linear in the images. What it needs is centroids that follow the shear.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import reduce
 from types import ModuleType
 from typing import Final
 
-from fdnt_xp.arrays import Array, array_namespace, as_floating, count_true, device_of, require_dtype
+from fdnt_xp.arrays import (
+    Array,
+    Rows,
+    array_namespace,
+    as_floating,
+    count_true,
+    device_of,
+    require_dtype,
+    rows_of,
+)
 from fdnt_xp.errors import FdntValueError, FdntWarning, ShapeMismatchError
 from fdnt_xp.flags import flag_names
 from fdnt_xp.fourier.psf import Psf
@@ -25,6 +33,7 @@ from fdnt_xp.nulltests.tests import NullTests
 from fdnt_xp.nulltests.weights import Weight
 from fdnt_xp.shapes.centroid import DipoleTests, starting_centroid, wide_weight
 from fdnt_xp.shapes.job import (
+    Chunk,
     Job,
     check_count,
     check_options,
@@ -128,14 +137,14 @@ def shear_from_stack(
     weights = xp.astype(galaxy_weights(everyone, galaxy_weight), stamps.dtype)
     centres = _from_the_middle(xp, stamps, centroids)
 
-    job = prepare(xp, stamps, psf, padding, None, _MAX_ITER)
+    job = prepare(xp, stamps, psf, padding=padding, max_iter=_MAX_ITER)
     sample = _Sample(
         stamps=stamps,
         weights=weights,
         centres=centres,
         normalise=normalise,
         n_groups=min(n_groups, n_gal),
-        n_chunk=chunk_size or galaxies_at_once(job.coarse, stamps),
+        chunks=job.chunks(n_gal, chunk_size or galaxies_at_once(job.coarse, stamps)),
     )
     stack, shapes = _solved(job, _common_weight(job), sample)
     if stack.n_excluded:
@@ -157,19 +166,13 @@ class _Sample:
     centres: Array | None
     normalise: bool
     n_groups: int
-    n_chunk: int
+    chunks: list[Chunk]
 
-    def chunks(self) -> Iterator[slice]:
-        """Yield the rows of one chunk after the other."""
-        n_gal = int(self.stamps.shape[0])
-        for start in range(0, n_gal, self.n_chunk):
-            yield slice(start, min(start + self.n_chunk, n_gal))
-
-    def members(self, rows: slice) -> Array:
+    def members(self, rows: Rows) -> Array:
         """Return which group each of the rows is in, as 0 and 1; shape (n_groups, n_rows)."""
         xp = array_namespace(stamps=self.stamps)
         like = {"dtype": xp.int64, "device": device_of(self.stamps)}
-        row = xp.arange(rows.start, rows.stop, **like)
+        row = xp.arange(rows.start, rows.stop, **like) if isinstance(rows, slice) else rows
         group = row * self.n_groups // int(self.stamps.shape[0])
         number = xp.arange(self.n_groups, **like)
         return xp.astype(group[None, :] == number[:, None], self.stamps.dtype)
@@ -212,7 +215,7 @@ def _solved(job: Job, weight: Weight, sample: _Sample) -> tuple[_Stack, ShapeRes
     for _ in range(_PASSES):
         stack = reduce(
             _Stack.plus,
-            (_stacked(job.rows(rows), weight, sample, rows, shear) for rows in sample.chunks()),
+            (_stacked(job.of(part), weight, sample, part.rows, shear) for part in sample.chunks),
         )
         n_filled = count_true(stack.weight > 0)
         if stack.n_used < 2 or n_filled < 2:
@@ -232,9 +235,9 @@ def _solved(job: Job, weight: Weight, sample: _Sample) -> tuple[_Stack, ShapeRes
     return stack, shapes
 
 
-def _stacked(job: Job, weight: Weight, sample: _Sample, rows: slice, shear: Array) -> _Stack:
+def _stacked(job: Job, weight: Weight, sample: _Sample, rows: Rows, shear: Array) -> _Stack:
     """Sum a chunk of galaxies, each moved to its centroid, by groups."""
-    stamps, flags = screen(sample.stamps[rows, :, :], job.psf)
+    stamps, flags = screen(rows_of(sample.stamps, rows), job.psf)
     xp = array_namespace(stamps=stamps)
     usable = flags == 0
     grid = job.coarse
@@ -244,12 +247,12 @@ def _stacked(job: Job, weight: Weight, sample: _Sample, rows: slice, shear: Arra
         wide = wide_weight(weight, grid, side, shear)
         centres = _find_centres(job, wide, galaxies, 0.5 * side)
     else:
-        given = sample.centres[rows, :]
+        given = rows_of(sample.centres, rows)
         finite = xp.isfinite(given[:, 0]) & xp.isfinite(given[:, 1])
         usable = usable & finite
         centres = xp.where(finite[:, None], given, xp.zeros_like(given))
     re, im = galaxies.shifted(grid, centres)
-    weights = sample.weights[rows]
+    weights = rows_of(sample.weights, rows)
     if sample.normalise:
         flux = xp.sum(xp.sum(stamps, axis=-1), axis=-1)
         usable = usable & (flux > 0)
