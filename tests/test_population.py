@@ -263,6 +263,41 @@ def test_the_error_that_the_noise_power_brings():
     }
 
 
+@pytest.mark.parametrize("isotropise", [True, False])
+def test_the_error_by_noise_is_the_scatter_of_repeated_observations(isotropise):
+    # Round galaxies too faint for anything but noise to matter would hide a lost term in v.
+    clean, psf, rng = (
+        ring((0.0, 0.0), n=8, eta=0.8),
+        fx.Psf.from_image(star()),
+        np.random.default_rng(4),
+    )
+    clean = np.concatenate([clean] * 4)
+    sigma = math.sqrt(np.mean(np.sum(clean**2, axis=(1, 2)))) / 30.0
+    found = [
+        fx.population_null(
+            clean + sigma * rng.standard_normal(clean.shape),
+            psf,
+            noise_variance=sigma**2,
+            isotropise=isotropise,
+            seed=seed,
+        )
+        for seed in range(300)
+    ]
+    scatter = np.std([one.g for one in found], axis=0)
+    stated = np.sqrt(np.mean([one.g_err_noise**2 for one in found], axis=0))
+    # 300 draws tell a standard deviation to 4 %.
+    np.testing.assert_allclose(stated, scatter, rtol=0.12)
+    assert np.all(stated < 0.5 * np.mean([one.g_err for one in found], axis=0))
+
+
+def test_without_noise_or_with_solved_shapes_there_is_no_error_by_noise():
+    images, psf = ring(SHEAR), fx.Psf.from_image(star())
+    assert fx.population_null(images, psf).g_err_noise is None
+    stamps, variance = noisy(100.0)
+    eta = fx.population_null(stamps, psf, statistic="eta", noise_variance=variance)
+    assert eta.g_err_noise is None
+
+
 def test_a_cut_leaves_some_out():
     stamps, variance = noisy(20.0)
     psf = fx.Psf.from_image(star())

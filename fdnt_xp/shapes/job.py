@@ -222,13 +222,22 @@ def screen(stamps: Array, psf: Psf, present: Array | None = None) -> tuple[Array
         Zero, or a reason of `fdnt_xp.flags.Flag`.
     """
     xp = array_namespace(stamps=stamps)
-    present = xp.ones_like(stamps, dtype=xp.bool) if present is None else present
-    finite = xp.all(xp.all(xp.isfinite(stamps) | ~present, axis=-1), axis=-1)
-    present = present & finite[:, None, None]
-    stamps = xp.where(present, stamps, xp.zeros_like(stamps))
-    infinite = xp.full_like(stamps, float("inf"))
-    brightest = xp.max(xp.max(xp.where(present, stamps, -infinite), axis=-1), axis=-1)
-    faintest = xp.min(xp.min(xp.where(present, stamps, infinite), axis=-1), axis=-1)
+    # Extremes along one long axis take a tenth of the time of those along two short ones.
+    n_gal, ny, nx = (int(n) for n in stamps.shape)
+    pixels = xp.reshape(stamps, (n_gal, ny * nx))
+    if present is not None:
+        present = xp.reshape(present, (n_gal, ny * nx))
+        pixels = xp.where(present, pixels, xp.zeros_like(pixels))
+    finite = xp.all(xp.isfinite(pixels), axis=-1)
+    # A host read: a copy of all stamps costs more, and hardly ever is one needed.
+    if not bool(xp.all(finite)):
+        pixels = xp.where(finite[:, None], pixels, xp.zeros_like(pixels))
+    seen_above, seen_below = pixels, pixels
+    if present is not None:
+        infinite = xp.full_like(pixels, float("inf"))
+        seen_above = xp.where(present, pixels, -infinite)
+        seen_below = xp.where(present, pixels, infinite)
+    brightest, faintest = xp.max(seen_above, axis=-1), xp.min(seen_below, axis=-1)
     flags = xp.zeros_like(brightest, dtype=xp.int32)
     for reason, holds in (
         (Flag.NON_FINITE_PIXEL, ~finite),
@@ -236,7 +245,7 @@ def screen(stamps: Array, psf: Psf, present: Array | None = None) -> tuple[Array
         (Flag.BAD_PSF, xp.broadcast_to(~psf.usable, finite.shape)),
     ):
         flags = flags + xp.astype(holds, xp.int32) * int(reason)
-    return stamps, flags
+    return xp.reshape(pixels, stamps.shape), flags
 
 
 def galaxies_at_once(grid: KGrid, stamps: Array, more: int = 0) -> int:

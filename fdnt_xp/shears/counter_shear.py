@@ -61,12 +61,16 @@ class FrameValues:
         Unknowns that were solved, the start of the next frame.
     quantities : FrameQuantities
         What cuts may be made on; NaN where the statistic failed.
+    v_variance : array, shape (n_gal, 2), optional
+        Of v by the noise of the pixels, the synthetic noise included; 0 where it failed.
+        Absent where the noise is unknown or not followed so far.
     """
 
     v: Array
     found: Array
     solution: Array
     quantities: FrameQuantities
+    v_variance: Array | None = None
 
 
 class Statistic(Protocol):
@@ -152,16 +156,20 @@ class FrozenQuadrupole:
         moments = moments_at(grid, galaxies, window, self.length * root.x)
         distance = self.length * xp.sqrt(xp.sum(root.x**2, axis=-1))
         found = root.success & (moments.monopole > 0) & (distance <= self.farthest)
-        norm = moments.monopole
-        if noise is not None and self.softening > 0:
-            norm = xp.sqrt(norm**2 + self.softening**2 * monopole_variance(grid, window, noise))
+        norm, variance = moments.monopole, None
+        if noise is not None:
+            covariance = MomentNoise.of(grid, window, noise)
+            norm = xp.sqrt(norm**2 + self.softening**2 * covariance.monopole)
         safe = xp.where(found, norm, xp.ones_like(norm))
         v = -moments.quadrupole / safe[:, None]
+        if noise is not None:
+            variance = _or_zero(covariance.of_ratio(v, moments.monopole, safe), found)
         return FrameValues(
             v=_or_zero(v, found),
             found=found,
             solution=xp.where(found[:, None], root.x + moments.step / self.length, start),
             quantities=frame_quantities(grid, window, moments, found, noise),
+            v_variance=variance,
         )
 
 
@@ -212,10 +220,44 @@ def moments_at(
     )
 
 
-def monopole_variance(grid: KGrid, window: Array, noise: FrameNoise) -> Array:
-    """Return the variance of `sum W Re I~ |kappa|²`, shape (n_gal,)."""
-    _, _, quartic = grid.even_moments(window**2 * noise.power)
-    return noise.variance * (quartic[:, 0] + 2.0 * quartic[:, 2] + quartic[:, 4])
+@dataclass(frozen=True, kw_only=True)
+class MomentNoise:
+    """Covariances of `q0` and `(q1, q2)` by the noise of the pixels; see `FrozenQuadrupole`.
+
+    Parameters
+    ----------
+    monopole : array, shape (n_gal,)
+        Variance of q0.
+    quadrupole, cross : array, shape (n_gal, 2)
+        Variances of q1 and q2, and their covariances with q0.
+    """
+
+    monopole: Array
+    quadrupole: Array
+    cross: Array
+
+    @classmethod
+    def of(cls, grid: KGrid, window: Array, noise: FrameNoise) -> MomentNoise:
+        """Return the noise under a fixed window: moments of the products of the monomials."""
+        xp = array_namespace(window=window)
+        _, _, quartic = grid.even_moments(window**2 * noise.power)
+        xxxx, xxxy, xxyy, xyyy, yyyy = _split(quartic)
+        column = noise.variance[:, None]
+        return cls(
+            monopole=noise.variance * (xxxx + 2.0 * xxyy + yyyy),
+            quadrupole=column * xp.stack([xxxx - 2.0 * xxyy + yyyy, 4.0 * xxyy], axis=-1),
+            cross=column * xp.stack([xxxx - yyyy, 2.0 * (xxxy + xyyy)], axis=-1),
+        )
+
+    def of_ratio(self, v: Array, monopole: Array, norm: Array) -> Array:
+        """Return the variance of `v = -q/D`, `D = norm = sqrt(q0² + c² n²)`, shape (n_gal, 2).
+
+        To first order, `dv = -(dq + v (q0/D) dq0)/D`. What the centroid brings in is of
+        second order for galaxies that look the same upside down, and left out for all.
+        """
+        slope = v * (monopole / norm)[:, None]
+        spread = self.quadrupole + 2.0 * slope * self.cross + slope**2 * self.monopole[:, None]
+        return spread / norm[:, None] ** 2
 
 
 def frame_quantities(

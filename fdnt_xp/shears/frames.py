@@ -239,9 +239,14 @@ def _withdrawn(values: FrameValues, flags: Array) -> SampleValues:
     def masked(column: Array) -> Array:
         return xp.where(usable, column, xp.full_like(column, math.nan))
 
+    def or_zero(pair: Array) -> Array:
+        return xp.where(usable[:, None], pair, xp.zeros_like(pair))
+
     quantities = {name: masked(getattr(values.quantities, name)) for name in QUANTITIES}
+    variance = values.v_variance
     return SampleValues(
-        v=xp.where(usable[:, None], values.v, xp.zeros_like(values.v)),
+        v=or_zero(values.v),
+        v_variance=None if variance is None else or_zero(variance),
         found=values.found & usable,
         solution=values.solution,
         quantities=FrameQuantities(**quantities),
@@ -265,6 +270,7 @@ def _joined(parts: list[SampleValues], place: Array | None) -> SampleValues:
     }
     return SampleValues(
         v=column("v"),
+        v_variance=None if parts[0].v_variance is None else column("v_variance"),
         found=column("found"),
         solution=column("solution"),
         quantities=FrameQuantities(**quantities),

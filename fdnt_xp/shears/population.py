@@ -23,7 +23,7 @@ from fdnt_xp.shears.estimate import ShearEstimate
 from fdnt_xp.shears.frames import FrameSample, Gamma, SampleValues
 from fdnt_xp.shears.masks import Masked
 from fdnt_xp.shears.null_search import OutOfReachError, find_null
-from fdnt_xp.shears.ratio import over_response, ratio_errors
+from fdnt_xp.shears.ratio import errors_by_noise, over_response, ratio_errors
 from fdnt_xp.shears.sample import LARGEST_SHEAR, NoiseOptions, StatisticName, make_sample
 from fdnt_xp.shears.weights import ShapeWeight
 
@@ -33,9 +33,9 @@ second order in the step, changes the speed of the search, not its root."""
 _TOLERANCE: Final = 1e-9
 _TOLERANCE_FLOAT32: Final = 2e-5
 """Smallest step in gamma worth taking: above the rounding of each galaxy's solution."""
-_TOLERANCE_NOISY, _TOLERANCE_HARD = 1e-2, 3e-2
-"""The same in noisy data, in standard errors; with a hard cut, where the mean has steps. The
-last step is taken, and what it leaves is smaller by the error of the response, 1e-3."""
+_TOLERANCE_NOISY: Final = 0.1
+"""The same in noisy data, in standard errors. The last step is taken, and what it leaves is
+smaller by the error of the response, of 1e-2."""
 _SLOPE_SEEN: Final = 1e-3
 """Least step in gamma from which a slope is learnt, where cuts or noise make the mean rough."""
 _DEFAULT_SHEAR: Final = 0.1
@@ -135,7 +135,9 @@ def population_null(
     -------
     ShearEstimate
         With `g_err` from the influence function and `g_err_jackknife` from leaving out 50
-        groups of neighbouring rows in turn. Galaxies for which the statistic fails count
+        groups of neighbouring rows in turn; with "frozen" and known noise also `g_err_noise`,
+        the part of it that is due to the noise of the pixels and to the synthetic noise, at
+        fixed weights of a cut. Galaxies for which the statistic fails count
         as zero, which is a spin-2 quantity too, and are reported in `n_excluded`, as are
         those that a cut removes and those in `n_masked`.
 
@@ -231,10 +233,11 @@ class _Null:
             n_excluded=int(total) - counted,
             n_masked=v.masked,
             n_filled=v.filled,
+            g_err_noise=None if v.variance is None else 0.5 * errors_by_noise(v.variance, response),
             g_err_jackknife=0.5 * errors[1],
             g_err_noise_power=None
             if noise_error is None or sample.noise is None
-            else 0.5 * noise_error * self._by_noise_power(gamma, v, response),
+            else 0.5 * noise_error * self._by_noise_power(gamma, response),
         )
 
     def find(self, origin: Gamma) -> tuple[Gamma, _Weighed, Array]:
@@ -275,17 +278,18 @@ class _Null:
         error = min(_pair(ratio_errors(v.values, response)[0]))
         if self.selection.hard:
             # A step of the mean is one galaxy, and moves the null by an error over sqrt(n).
-            return max(least, (_TOLERANCE_HARD + 1.0 / math.sqrt(v.counted)) * error)
+            return max(least, (_TOLERANCE_NOISY + 1.0 / math.sqrt(v.counted)) * error)
         return max(least, _TOLERANCE_NOISY * error)
 
-    def _by_noise_power(self, gamma: Gamma, v: _Weighed, response: Array) -> Array:
+    def _by_noise_power(self, gamma: Gamma, response: Array) -> Array:
         """Return by how much gamma moves for a relative change of the noise power by 1."""
-        xp = array_namespace(v=v.values)
+        xp = array_namespace(response=response)
         more = replace(self, sample=self.sample.told_of_noise(1.0 + _POWER_STEP))
-        (changed,) = more._look((gamma,))
+        # Both are looked at there: the search ends a step away from where it looked last.
+        (now,), (changed,) = self._look((gamma,)), more._look((gamma,))
         moved = over_response(
             xp.mean(response, axis=0)[None, :, :],
-            xp.mean(changed.values - v.values, axis=0)[None, :],
+            xp.mean(changed.values - now.values, axis=0)[None, :],
         )
         return xp.abs(moved[0, :]) / _POWER_STEP
 
@@ -306,9 +310,13 @@ class _Null:
 
 @dataclass(frozen=True, kw_only=True)
 class _Weighed:
-    """The statistic of each galaxy times what it counts, how many count, and their S/N."""
+    """The statistic of each galaxy times what it counts, how many count, and their S/N.
+
+    `variance` is that of the values by the noise of the pixels.
+    """
 
     values: Array
+    variance: Array | None
     counted: int
     found: int
     masked: int
@@ -320,8 +328,12 @@ class _Weighed:
         weight = selection.weight(frame.quantities) if selection.cuts else None
         kept = frame.found if weight is None else frame.found & (weight > 0)
         values = frame.v if weight is None else frame.v * weight[:, None]
+        variance = frame.v_variance
+        if variance is not None and weight is not None:
+            variance = variance * weight[:, None] ** 2
         return cls(
             values=values,
+            variance=variance,
             counted=count_true(kept),
             found=count_true(frame.found),
             masked=count_true(has_any(frame.flags, int(Flag.MASKED))),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from typing import Final
 
-from fdnt_xp.arrays import Array, array_namespace
+from fdnt_xp.arrays import Array, array_namespace, device_of
 
 _JACKKNIFE_GROUPS: Final = 50
 
@@ -53,3 +53,21 @@ def ratio_errors(v: Array, response: Array) -> tuple[Array, Array]:
     estimates = over_response(xp.stack(left_r), xp.stack(left_v))
     scatter = estimates - xp.mean(estimates, axis=0)
     return by_influence, xp.sqrt(xp.sum(scatter**2, axis=0) * ((n_group - 1.0) / n_group))
+
+
+def errors_by_noise(variance: Array, response: Array) -> Array:
+    """Return the standard errors of `<R>⁻¹ <v>` from the variances of each v, (2,).
+
+    Parameters
+    ----------
+    variance : array, shape (n_gal, 2)
+        Of v1 and v2, which are taken as independent.
+    response : array, shape (n_gal, 2, 2)
+    """
+    xp = array_namespace(variance=variance)
+    n_gal = int(variance.shape[0])
+    error = xp.sqrt(xp.sum(variance, axis=0)) / n_gal
+    mean_response = xp.mean(response, axis=0)[None, :, :]
+    one_by_one = error[None, :] * xp.eye(2, dtype=error.dtype, device=device_of(error))
+    moved = over_response(mean_response, one_by_one)
+    return xp.sqrt(xp.sum(moved**2, axis=0))
