@@ -73,6 +73,11 @@ def test_a_weight_bounds_the_influence_and_keeps_the_answer():
         np.testing.assert_allclose(estimate.g, SHEAR, atol=1e-7)
 
 
+def test_a_bound_on_elongated_galaxies_keeps_the_answer():
+    estimate = fx.population_null(ring(SHEAR), fx.Psf.from_image(star()), bound=3.0)
+    np.testing.assert_allclose(estimate.g, SHEAR, atol=1e-7)
+
+
 @pytest.mark.parametrize("statistic", STATISTICS)
 def test_a_given_size_and_a_smaller_reach(statistic):
     images, psf = ring(SHEAR), fx.Psf.from_image(star())
@@ -263,8 +268,8 @@ def test_the_error_that_the_noise_power_brings():
     }
 
 
-@pytest.mark.parametrize("isotropise", [True, False])
-def test_the_error_by_noise_is_the_scatter_of_repeated_observations(isotropise):
+@pytest.mark.parametrize(("isotropise", "bound"), [(True, 0.0), (False, 0.0), (True, 3.0)])
+def test_the_error_by_noise_is_the_scatter_of_repeated_observations(isotropise, bound):
     # Round galaxies too faint for anything but noise to matter would hide a lost term in v.
     clean, psf, rng = (
         ring((0.0, 0.0), n=8, eta=0.8),
@@ -279,6 +284,7 @@ def test_the_error_by_noise_is_the_scatter_of_repeated_observations(isotropise):
             psf,
             noise_variance=sigma**2,
             isotropise=isotropise,
+            bound=bound,
             seed=seed,
         )
         for seed in range(300)
@@ -343,6 +349,8 @@ def test_a_shear_beyond_the_margin_widens_it():
         ({"noise_variance": 1.0, "identifiers": np.arange(3)}, ShapeMismatchError, "identifiers"),
         ({"noise_error": -0.1}, RangeError, "noise_error = -0.1"),
         ({"softening": -1.0}, RangeError, "softening = -1"),
+        ({"bound": math.nan}, RangeError, "bound = nan"),
+        ({"bound": 3.0, "statistic": "eta"}, FdntValueError, "bound goes with"),
         ({"cut": {"snr": (5.0, None)}}, FdntValueError, "a cut on snr needs"),
         ({"cut": 3}, FdntTypeError, "cut must be"),
     ],

@@ -67,7 +67,7 @@ class NoiseBias:
         Range of a quantity, in the counter-sheared frame.
     observed_cut : float, optional
         Fraction that was removed by their S/N as seen.
-    softening, padding
+    softening, bound, padding
         Of `population_null`.
     """
 
@@ -87,6 +87,7 @@ class NoiseBias:
     cut: str | None = None
     observed_cut: float | None = None
     softening: float = 1.0
+    bound: float = 0.0
     padding: int = 1
     control: bool = False
 
@@ -127,6 +128,7 @@ def noise_bias(
     cut: Cut | None = None,
     observed_cut: float | None = None,
     softening: float = 1.0,
+    bound: float = 0.0,
     padding: int = 1,
     control: bool = True,
     seed: int = 0,
@@ -153,7 +155,7 @@ def noise_bias(
     observed_cut : float, optional
         Remove this fraction of the stamps, those of the least S/N on the image as seen. It
         biases, as every such cut does.
-    softening, padding
+    softening, bound, padding
         Of `population_null`.
     control : bool
         Whether to take off what is known of the noise and has no mean, for estimators that
@@ -196,6 +198,7 @@ def noise_bias(
         to_array=to_array,
         cut=cut,
         softening=softening,
+        bound=bound,
         padding=padding,
     )
     n_batches = max(2, math.ceil(n_stamps / (VERSIONS * batch)))
@@ -225,6 +228,7 @@ def noise_bias(
         "cut": None if cut is None else f"{cut.quantity} {cut.low} to {cut.high}",
         "observed_cut": observed_cut,
         "softening": softening,
+        "bound": bound,
         "padding": padding,
     }
     return [tally.result(common) for tally in tallies.values()]

@@ -1,14 +1,14 @@
 """A control variate for tests of noise bias: what noise does to the null at second order.
 
 In a simulation both the galaxy and its noise are known. Expand the frozen quadrupole
-`u = q/D(q0)`, `D = sqrt(q0² + c² n²)`, to second order in the noise about the galaxy without
-noise, at its true centroid, in the frame of the true shear. With δ the part of a moment that is
-linear in the noise, d the dipole, A the second moments, `δx = -A⁻¹ δd` the step of the
-centroid, and `c_i = sum W M f_i kappa`, `Q_i = -sum W R f_i kappa kappa`, where `f_i` is the
-monomial of `q_i` (docs, "Tests of bias with less noise")::
+`u = (q1, q2)/D`, `D = sqrt(q0² + c² n² + b² (q1² + q2²))`, a function of `q = (q1, q2, q0)`, to
+second order in the noise about the galaxy without noise, at its true centroid, in the frame of
+the true shear. With δ the part of a moment that is linear in the noise, d the dipole, A the
+second moments, `δx = -A⁻¹ δd` the step of the centroid, and `c_i = sum W M f_i kappa`,
+`Q_i = -sum W R f_i kappa kappa`, where `f_i` is the monomial of `q_i` (docs, "Tests of bias
+with less noise")::
 
-    T_i = - δq_i δq0 D'/D² + q_i δq0² (D'²/D³ - D''/2D²)
-          + (δx.Q_i.δx/2 - δc_i.δx)/D - q_i D'/D² (δx.Q_0.δx/2 - δc_0.δx)
+    T = 1/2 d²u/dq_i dq_j δq_i δq_j + du/dq_i (δx.Q_i.δx/2 - δc_i.δx)
 
 Its expectation is a sum over modes of the noise power, known exactly. So `T - <T>` has the
 mean 0 whatever the estimator does, and nearly all of the scatter that is left when noise of
@@ -49,7 +49,7 @@ class KnownNoise:
     identifiers, symmetry : array of int64, shape (n_gal,)
     seed : int
         Of the synthetic noise, as `population_null` is told.
-    softening, max_shear, padding
+    softening, bound, max_shear, padding
         Of `population_null`; for `measure_responses` its step is the reach.
     """
 
@@ -61,6 +61,7 @@ class KnownNoise:
     symmetry: NDArray[np.int64]
     seed: int
     softening: float = 1.0
+    bound: float = 0.0
     max_shear: float = 0.1
     padding: int = 1
 
@@ -86,6 +87,7 @@ def second_order(known: KnownNoise, gamma: Gamma) -> Real:
         weight=None,
         size=None,
         softening=known.softening,
+        bound=known.bound,
         max_shear=known.max_shear,
         padding=known.padding,
         chunk_size=None,
@@ -130,7 +132,7 @@ def _of_chunk(sample: FrameSample, job: Job, known: KnownNoise, gamma: Gamma) ->
         known.variance * wanted,
         statistic.length * solution,
     )
-    return moments.second_order(statistic.softening)
+    return moments.second_order(statistic.softening, statistic.bound)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,8 +148,8 @@ class _Moments:
     dq: Real  # (n_gal, 3)
     d: Real  # (n_gal, 2)
     c: Real  # (n_gal, 3, 2)
-    var_q0: Real  # (n_psf,)
-    cov_q_q0: Real  # (n_psf, 2)
+    soft: Real  # (n_psf,), n²: the variance of q0
+    cov_q: Real  # (n_psf, 3, 3)
     cov_d: Real  # (n_psf, 2, 2)
     cov_c_d: Real  # (n_psf, 3, 2, 2)
 
@@ -175,13 +177,13 @@ class _Moments:
             dq=_quadrupoles(n2),
             d=n1,
             c=_quadrupoles_by_k(n3),
-            var_q0=p4[:, 0] + 2.0 * p4[:, 2] + p4[:, 4],
-            cov_q_q0=np.stack([p4[:, 0] - p4[:, 4], 2.0 * (p4[:, 1] + p4[:, 3])], axis=-1),
+            soft=p4[:, 0] + 2.0 * p4[:, 2] + p4[:, 4],
+            cov_q=_covariance(p4),
             cov_d=_matrix(p2),
             cov_c_d=_quadrupoles_by_pairs(p4),
         )
 
-    def second_order(self, softening: float) -> Real:
+    def second_order(self, softening: float, bound: float) -> Real:
         """Return `T - <T>` of v = -u, shape (n_gal, 2)."""
         inverse = np.linalg.inv(self.A)
         step = -np.einsum("nij,nj->ni", inverse, self.d)
@@ -190,22 +192,26 @@ class _Moments:
         step_cov = np.einsum("nij,njk,nlk->nil", inverse, self.cov_d + 0 * inverse, inverse)
         expected = 0.5 * np.einsum("nij,nfij->nf", step_cov, self.Q)
         expected += np.einsum("nfij,nij->nf", self.cov_c_d + 0 * self.Q, inverse)
-        products = self.dq[:, :2] * self.dq[:, 2:] - self.cov_q_q0
-        square = self.dq[:, 2] ** 2 - self.var_q0
-        return -self._terms(softening, products, square, by_centroid - expected)
+        products = self.dq[:, :, None] * self.dq[:, None, :] - self.cov_q
+        gradient, hessian = self._derivatives(softening, bound)
+        by_products = 0.5 * np.einsum("nfij,nij->nf", hessian, products)
+        return np.asarray(-by_products - np.einsum("nfi,ni->nf", gradient, by_centroid - expected))
 
-    def _terms(self, softening: float, products: Real, square: Real, by_centroid: Real) -> Real:
-        """Return T of δq_i δq0, δq0² and what the centroid does to (q1, q2, q0)."""
-        q, q0 = self.q[:, :2], self.q[:, 2:]
-        soft = softening**2 * self.var_q0[:, None]
-        D = np.sqrt(q0**2 + soft)
-        first, second = q0 / D, soft / D**3
-        return np.asarray(
-            -products * first / D**2
-            + q * square[:, None] * (first**2 / D**3 - 0.5 * second / D**2)
-            + by_centroid[:, :2] / D
-            - q * by_centroid[:, 2:] * first / D**2
-        )
+    def _derivatives(self, softening: float, bound: float) -> tuple[Real, Real]:
+        """Return the derivatives of u by q, (n_gal, 2, 3), and the second ones, (n_gal, 2, 3, 3).
+
+        With `D_i = w_i q_i/D`, `w = (b², b², 1)`, and `D_ij = (w_i δ_ij - D_i D_j)/D`, they are
+        `u_fi = (δ_fi - u_f D_i)/D` and `u_fij = -(u_fi D_j + u_fj D_i + u_f D_ij)/D`.
+        """
+        q, w = self.q, np.array([bound**2, bound**2, 1.0])
+        D = np.sqrt(np.sum(w * q**2, axis=-1) + softening**2 * self.soft)[:, None]
+        slope = w * q / D
+        curvature = (np.diag(w) - slope[:, :, None] * slope[:, None, :]) / D[:, :, None]
+        u, unit = q[:, :2] / D, np.eye(3)[:2]
+        gradient = (unit - u[:, :, None] * slope[:, None, :]) / D[:, :, None]
+        crossed = gradient[:, :, :, None] * slope[:, None, None, :]
+        bent = crossed + np.swapaxes(crossed, 2, 3) + u[:, :, None, None] * curvature[:, None]
+        return gradient, -bent / D[:, :, None, None]
 
 
 def _matrix(m2: Real) -> Real:
@@ -216,6 +222,18 @@ def _matrix(m2: Real) -> Real:
 def _quadrupoles(m2: Real) -> Real:
     """Return the moments of `kx² - ky²`, `2 kx ky` and `|k|²` from those of degree 2."""
     return np.stack([m2[:, 0] - m2[:, 2], 2.0 * m2[:, 1], m2[:, 0] + m2[:, 2]], axis=-1)
+
+
+def _covariance(p4: Real) -> Real:
+    """Return the covariance of (q1, q2, q0), (n, 3, 3), from fourth moments of the noise."""
+    xxxx, xxxy, xxyy, xyyy, yyyy = p4.T
+    both, first, second = 2.0 * (xxxy - xyyy), xxxx - yyyy, 2.0 * (xxxy + xyyy)
+    rows = [
+        [xxxx - 2.0 * xxyy + yyyy, both, first],
+        [both, 4.0 * xxyy, second],
+        [first, second, xxxx + 2.0 * xxyy + yyyy],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)
 
 
 def _quadrupoles_by_k(m3: Real) -> Real:

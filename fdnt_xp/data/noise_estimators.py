@@ -49,7 +49,7 @@ class Settings:
         From NumPy to that library.
     cut : Cut or None
         In the counter-sheared frame.
-    softening, padding
+    softening, bound, padding
         Of `population_null`.
     """
 
@@ -59,6 +59,7 @@ class Settings:
     to_array: Callable[[NDArray[np.float64]], Array]
     cut: Cut | None
     softening: float
+    bound: float
     padding: int
 
 
@@ -111,7 +112,9 @@ def _null(stamps: NoisyStamps, settings: Settings, **options: Any) -> Found:
             cut=settings.cut,
             padding=settings.padding,
             **numbers,
-            **{"softening": settings.softening, **options},
+            softening=settings.softening,
+            bound=settings.bound,
+            **{"bound": settings.bound, **options},
         )
     )
 
@@ -121,7 +124,7 @@ def _null_plain(stamps: NoisyStamps, settings: Settings) -> Found:
 
 
 def _null_eta(stamps: NoisyStamps, settings: Settings) -> Found:
-    return _null(stamps, settings, statistic="eta")
+    return _null(stamps, settings, statistic="eta", bound=0.0)
 
 
 def _responses(stamps: NoisyStamps, settings: Settings) -> Found:
@@ -132,6 +135,7 @@ def _responses(stamps: NoisyStamps, settings: Settings) -> Found:
         noise_variance=stamps.variance,
         seed=stamps.seed,
         softening=settings.softening,
+        bound=settings.bound,
         step=RESPONSE_STEP,
         padding=settings.padding,
         **numbers,
@@ -182,6 +186,7 @@ def _control(
         symmetry=stamps.symmetry,
         seed=stamps.seed,
         softening=settings.softening,
+        bound=settings.bound,
         max_shear=reach,
         padding=settings.padding,
     )
@@ -192,6 +197,7 @@ def _control(
         noise_variance=stamps.variance,
         isotropise=False,
         softening=settings.softening,
+        bound=settings.bound,
         size=default_size(psf),
         padding=settings.padding,
     )

@@ -14,7 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, Protocol
 
-from fdnt_xp.arrays import Array, array_namespace
+from fdnt_xp.arrays import Array, array_namespace, device_of
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.transform import DeconvolvedStamps
 from fdnt_xp.nulltests.dogleg import DoglegOptions, find_root
@@ -112,8 +112,9 @@ class FrozenQuadrupole:
 
     In the counter-sheared frame, at the centroid where the dipole vanishes::
 
-        v = -(q1, q2) / sqrt(q0² + c² n²),   q1 = sum W Re I~ (kx² - ky²),
-        q0 = sum W Re I~ |kappa|²,           q2 = sum W Re I~ 2 kx ky,
+        v = -(q1, q2) / sqrt(q0² + c² n² + b² (q1² + q2²)),
+
+        q0 = sum W Re I~ |kappa|²,  q1 = sum W Re I~ (kx² - ky²),  q2 = sum W Re I~ 2 kx ky,
 
     with n the noise of q0, and 0 where the noise is unknown. No shape is solved: eta stays
     0. A galaxy elongated along x is narrow in kx, hence the sign.
@@ -126,6 +127,8 @@ class FrozenQuadrupole:
         Unit of centroids, pixels.
     softening : float
         c. The larger it is, the less a faint galaxy counts.
+    bound : float
+        b. The larger it is, the less an elongated galaxy counts: `|v| < 1/b`.
     farthest : float
         Largest distance of a centroid from the middle of the stamp, pixels.
     """
@@ -133,6 +136,7 @@ class FrozenQuadrupole:
     size: float
     length: float
     softening: float
+    bound: float
     farthest: float
 
     @property
@@ -156,14 +160,17 @@ class FrozenQuadrupole:
         moments = moments_at(grid, galaxies, window, self.length * root.x)
         distance = self.length * xp.sqrt(xp.sum(root.x**2, axis=-1))
         found = root.success & (moments.monopole > 0) & (distance <= self.farthest)
-        norm, variance = moments.monopole, None
+        square, variance = moments.monopole**2, None
         if noise is not None:
             covariance = MomentNoise.of(grid, window, noise)
-            norm = xp.sqrt(norm**2 + self.softening**2 * covariance.monopole)
-        safe = xp.where(found, norm, xp.ones_like(norm))
+            square = square + self.softening**2 * covariance.monopole
+        square = square + self.bound**2 * xp.sum(moments.quadrupole**2, axis=-1)
+        safe = xp.sqrt(xp.where(found, square, xp.ones_like(square)))
         v = -moments.quadrupole / safe[:, None]
         if noise is not None:
-            variance = _or_zero(covariance.of_ratio(v, moments.monopole, safe), found)
+            variance = _or_zero(
+                covariance.of_ratio(v, moments.monopole / safe, safe, self.bound), found
+            )
         return FrameValues(
             v=_or_zero(v, found),
             found=found,
@@ -228,8 +235,10 @@ class MomentNoise:
     ----------
     monopole : array, shape (n_gal,)
         Variance of q0.
-    quadrupole, cross : array, shape (n_gal, 2)
-        Variances of q1 and q2, and their covariances with q0.
+    quadrupole : array, shape (n_gal, 2, 2)
+        Covariance of q1 and q2.
+    cross : array, shape (n_gal, 2)
+        Their covariances with q0.
     """
 
     monopole: Array
@@ -242,21 +251,41 @@ class MomentNoise:
         xp = array_namespace(window=window)
         _, _, quartic = grid.even_moments(window**2 * noise.power)
         xxxx, xxxy, xxyy, xyyy, yyyy = _split(quartic)
-        column = noise.variance[:, None]
+        both = 2.0 * (xxxy - xyyy)
+        first = xp.stack([xxxx - 2.0 * xxyy + yyyy, both], axis=-1)
+        second = xp.stack([both, 4.0 * xxyy], axis=-1)
+        cross = xp.stack([xxxx - yyyy, 2.0 * (xxxy + xyyy)], axis=-1)
         return cls(
             monopole=noise.variance * (xxxx + 2.0 * xxyy + yyyy),
-            quadrupole=column * xp.stack([xxxx - 2.0 * xxyy + yyyy, 4.0 * xxyy], axis=-1),
-            cross=column * xp.stack([xxxx - yyyy, 2.0 * (xxxy + xyyy)], axis=-1),
+            quadrupole=noise.variance[:, None, None] * xp.stack([first, second], axis=1),
+            cross=noise.variance[:, None] * cross,
         )
 
-    def of_ratio(self, v: Array, monopole: Array, norm: Array) -> Array:
-        """Return the variance of `v = -q/D`, `D = norm = sqrt(q0² + c² n²)`, shape (n_gal, 2).
+    def of_ratio(self, v: Array, ratio: Array, norm: Array, bound: float) -> Array:
+        """Return the variance of `v = -q/D`, shape (n_gal, 2).
 
-        To first order, `dv = -(dq + v (q0/D) dq0)/D`. What the centroid brings in is of
-        second order for galaxies that look the same upside down, and left out for all.
+        To first order `D dv = -(dq - b² v (v.dq) + v (q0/D) dq0)`. What the centroid brings
+        in is of second order for galaxies that look the same upside down, and left out for
+        all.
+
+        Parameters
+        ----------
+        v : array, shape (n_gal, 2)
+        ratio, norm : array, shape (n_gal,)
+            q0/D and D.
+        bound : float
+            b.
         """
-        slope = v * (monopole / norm)[:, None]
-        spread = self.quadrupole + 2.0 * slope * self.cross + slope**2 * self.monopole[:, None]
+        xp = array_namespace(v=v)
+        unit = xp.eye(2, dtype=v.dtype, device=device_of(v))
+        by_quadrupole = unit - bound**2 * v[:, :, None] * v[:, None, :]
+        by_monopole = v * ratio[:, None]
+        moved = xp.matmul(by_quadrupole, self.quadrupole + xp.zeros_like(by_quadrupole))
+        spread = xp.sum(moved * by_quadrupole, axis=-1)
+        spread = spread + 2.0 * by_monopole * xp.sum(
+            by_quadrupole * self.cross[:, None, :], axis=-1
+        )
+        spread = spread + by_monopole**2 * self.monopole[:, None]
         return spread / norm[:, None] ** 2
 
 

@@ -65,6 +65,7 @@ def population_null(
     weight: ShapeWeight | None = None,
     size: float | None = None,
     softening: float = 1.0,
+    bound: float = 0.0,
     max_shear: float | None = None,
     padding: int = 1,
     chunk_size: int | None = None,
@@ -124,6 +125,9 @@ def population_null(
     softening : float
         Of "frozen": see `FrozenQuadrupole`. 8 weighs a sample of many fluxes better and is
         more sensitive to an error of the noise power.
+    bound : float
+        Of "frozen": see `FrozenQuadrupole`. 3 takes 1 to 2 % off the error of the shear at
+        S/N 10 to 15, and up to 4 % at 50, where shapes scatter as those of galaxies do.
     max_shear : float, optional
         Largest `|g|` in reach. The weight's disc is smaller than the PSF's by
         `sqrt((1 + max_shear)/(1 - max_shear))`, which costs resolution. By default 0.1, and
@@ -182,6 +186,7 @@ def population_null(
             weight=weight,
             size=size,
             softening=softening,
+            bound=bound,
             max_shear=largest,
             padding=padding,
             chunk_size=chunk_size,

@@ -155,6 +155,7 @@ def measure_responses(
     masked: Masked = "drop",
     size: float | None = None,
     softening: float = 1.0,
+    bound: float = 0.0,
     step: float = 0.01,
     padding: int = 1,
     chunk_size: int | None = None,
@@ -168,7 +169,7 @@ def measure_responses(
     mask, masked
         As for `population_null`; what is left out is flagged `MASKED`, what was filled
         `FILLED`.
-    size, softening, padding, chunk_size
+    size, softening, bound, padding, chunk_size
         As for `population_null`, statistic "frozen".
     step : float
         Reduced shear h of the frames, up to 0.1. The differences err by a part of order h².
@@ -193,6 +194,7 @@ def measure_responses(
         weight=None,
         size=size,
         softening=softening,
+        bound=bound,
         max_shear=step,
         padding=padding,
         chunk_size=chunk_size,

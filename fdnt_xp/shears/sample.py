@@ -58,6 +58,7 @@ def make_sample(
     weight: ShapeWeight | None,
     size: float | None,
     softening: float,
+    bound: float = 0.0,
     max_shear: float,
     padding: int,
     chunk_size: int | None,
@@ -82,6 +83,10 @@ def make_sample(
         raise FdntValueError('weight goes with statistic="eta"; "frozen" is bounded by itself')
     if not (math.isfinite(softening) and softening >= 0.0):
         raise RangeError("softening", softening, 0.0, None)
+    if not (math.isfinite(bound) and bound >= 0.0):
+        raise RangeError("bound", bound, 0.0, None)
+    if bound > 0.0 and statistic != "frozen":
+        raise FdntValueError('bound goes with statistic="frozen"; "eta" takes a weight')
     sample_noise = _sample_noise(xp, stamps, noise)
     noisy = sample_noise is not None
     seen_by = psf.ending_at(_NOISY_FLOOR) if noisy else psf
@@ -93,6 +98,7 @@ def make_sample(
             size=frozen_size,
             length=job.length,
             softening=softening,
+            bound=bound,
             farthest=0.5 * min(int(n) for n in stamps.shape[1:]),
         )
     else:
