@@ -143,6 +143,12 @@ def test_bare_shapes_give_the_same():
     np.testing.assert_array_equal(bare.g, full.g)
     np.testing.assert_array_equal(bare.g_err, full.g_err)
     assert bare.g_err_noise is None
+    cov = np.broadcast_to(0.01 * np.eye(2), (128, 2, 2))
+    bare = shear_from_eta(eta, "lorentzian", eg=eg, eta_cov=cov)
+    full = fx.shear_from_shapes(result(eta, eg=eg, cov=cov), "lorentzian")
+    np.testing.assert_array_equal(bare.g_err_noise, full.g_err_noise)
+    with pytest.raises(ShapeMismatchError, match=r"eta_cov must have the shape \(128, 2, 2\)"):
+        shear_from_eta(eta, eta_cov=cov[:5])
 
 
 # --- errors --------------------------------------------------------------------------

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import json
-import signal
-import warnings
-from collections.abc import Callable
 from pathlib import Path
-from types import FrameType
-from typing import Any, TextIO, TypeVar
+from typing import Any
 
 import click
 
 import fdnt_xp
-from fdnt_xp.app.backends import BACKENDS, DTYPES
 from fdnt_xp.app.check import CheckOptions, run_check
+from fdnt_xp.app.command import HOW, OVERWRITE, WHERE, Command
 from fdnt_xp.app.demo import Field, run_demo
 from fdnt_xp.app.gradient_figure import GradientFigure, draw_gradient_figure
+from fdnt_xp.app.great08_commands import great08
 from fdnt_xp.app.measure import Inputs, Settings, measure_files
 from fdnt_xp.app.plots import check_figure, plot_catalog, save_figure
 from fdnt_xp.app.ring import RingOptions, run_ring
@@ -26,109 +23,6 @@ from fdnt_xp.app.underfitting_figure import UnderfittingFigure, draw_underfittin
 from fdnt_xp.data.catalog import check_catalog, read_catalog, write_catalog
 from fdnt_xp.data.noise_estimators import ESTIMATORS
 from fdnt_xp.data.versions import KINDS
-from fdnt_xp.errors import FdntError, FdntWarning
-
-_F = TypeVar("_F", bound=Callable[..., Any])
-_INTERRUPTED = 130
-"""Exit code of a command that Ctrl-C ended, as shells have it."""
-
-
-class _Command(click.Command):
-    """A command whose foreseen errors, warnings and interrupts are one plain line each."""
-
-    def invoke(self, ctx: click.Context) -> Any:
-        """Run the command."""
-        previous = signal.signal(signal.SIGTERM, _terminate)
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("always", FdntWarning)
-                warnings.showwarning = _show_warning
-                return super().invoke(ctx)
-        except FdntError as error:
-            raise click.ClickException(" ".join(str(error).split())) from error
-        except KeyboardInterrupt:
-            click.echo("Interrupted: nothing unfinished was left behind.", err=True)
-            ctx.exit(_INTERRUPTED)
-        finally:
-            signal.signal(signal.SIGTERM, previous)
-
-
-def _terminate(_number: int, _frame: FrameType | None) -> None:
-    """Let a polite kill end like Ctrl-C, so that temporary files are removed."""
-    raise KeyboardInterrupt
-
-
-def _show_warning(
-    message: Warning | str,
-    category: type[Warning],
-    filename: str,  # noqa: ARG001  the signature is Python's
-    lineno: int,  # noqa: ARG001
-    file: TextIO | None = None,  # noqa: ARG001
-    line: str | None = None,  # noqa: ARG001
-) -> None:
-    # Warnings of other libraries are about their code, not about the user's galaxies.
-    if issubclass(category, FdntWarning):
-        click.echo(f"Warning: {message}", err=True)
-
-
-def _options(*decorators: Callable[[_F], _F]) -> Callable[[_F], _F]:
-    """Return the decorators as one; the first is listed first by `--help`."""
-
-    def decorate(function: _F) -> _F:
-        for decorator in reversed(decorators):
-            function = decorator(function)
-        return function
-
-    return decorate
-
-
-_WHERE = _options(
-    click.option(
-        "--backend",
-        type=click.Choice(list(BACKENDS)),
-        default="numpy",
-        show_default=True,
-        help="Array library to compute with.",
-    ),
-    click.option("--device", metavar="NAME", help="cpu, cuda, cuda:1, ... [default: its own]"),
-    click.option(
-        "--dtype",
-        type=click.Choice(DTYPES),
-        default="float64",
-        show_default=True,
-        help="Precision.",
-    ),
-)
-_HOW = _options(
-    _WHERE,
-    click.option(
-        "--oversampling",
-        type=click.IntRange(min=1),
-        default=1,
-        show_default=True,
-        help="PSF pixels per image pixel, along one axis.",
-    ),
-    click.option(
-        "--noise-variance",
-        type=float,
-        metavar="V",
-        help="Of one pixel. [default: measured on the borders of the stamps]",
-    ),
-    click.option(
-        "--size",
-        type=float,
-        metavar="PIXELS",
-        help="Size (sigma) of the weight. [default: solved for each galaxy]",
-    ),
-    click.option(
-        "--chunk",
-        type=click.IntRange(min=1),
-        metavar="N",
-        help="Galaxies at a time; bounds the memory. [default: 256, on a GPU 8192]",
-    ),
-    click.option("-q", "--quiet", is_flag=True, help="No progress bar and no summary."),
-)
-_OVERWRITE = click.option("--overwrite", is_flag=True, help="Replace files that exist.")
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -137,7 +31,7 @@ def main() -> None:
     """Shapes of galaxies for weak lensing, by Fourier-domain null tests."""
 
 
-@main.command(cls=_Command)
+@main.command(cls=Command)
 @click.argument("image")
 @click.option("--psf", required=True, metavar="FITS", help="Image of a star, or a cube of them.")
 @click.option("--cell", type=int, metavar="N", help="The image is a grid of N x N pixel cells.")
@@ -182,8 +76,16 @@ def main() -> None:
     metavar="FITS",
     help="Blank sky to measure the noise on: an image, or a cube of stamps.",
 )
-@_HOW
-@_OVERWRITE
+@click.option(
+    "--mask", metavar="FITS", help="Of the shape of IMAGE: not 0 where a pixel is missing."
+)
+@click.option(
+    "--weight",
+    metavar="FITS",
+    help="Of the shape of IMAGE: the inverse variance of each pixel, 0 where it is missing.",
+)
+@HOW
+@OVERWRITE
 def measure(
     image: str,
     psf: str,
@@ -195,6 +97,8 @@ def measure(
     origin: str,
     output: str,
     noise_image: str | None,
+    mask: str | None,
+    weight: str | None,
     overwrite: bool,
     **how: Any,
 ) -> None:
@@ -214,6 +118,8 @@ def measure(
         y_column=y_column,
         origin=int(origin),
         noise_image=noise_image,
+        mask=mask,
+        weight=weight,
     )
     settings = Settings(**how)
     inputs.refuse_as_output(output)
@@ -226,12 +132,12 @@ def measure(
         click.echo(f"written    {output}")
 
 
-@main.command(cls=_Command)
+@main.command(cls=Command)
 @click.argument("catalog")
 @click.option(
     "-o", "--output", metavar="FIGURE", help=".png, .pdf or .svg. [default: CATALOG with .png]"
 )
-@_OVERWRITE
+@OVERWRITE
 def plot(catalog: str, output: str | None, overwrite: bool) -> None:
     """Draw a page about CATALOG: map of the image, histograms, S/N, flags."""
     target = Path(output) if output else Path(catalog).with_suffix(".png")
@@ -241,7 +147,7 @@ def plot(catalog: str, output: str | None, overwrite: bool) -> None:
     click.echo(f"written    {target}")
 
 
-@main.command(name="shear", cls=_Command)
+@main.command(name="shear", cls=Command)
 @click.argument("catalog")
 @click.option(
     "--cut",
@@ -266,7 +172,7 @@ def mean_shear(catalog: str, cuts: tuple[str, ...], as_json: bool) -> None:
         click.echo(line)
 
 
-@main.command(cls=_Command)
+@main.command(cls=Command)
 @click.option(
     "-o",
     "--output",
@@ -291,8 +197,8 @@ def mean_shear(catalog: str, cuts: tuple[str, ...], as_json: bool) -> None:
 )
 @click.option("--random-shear", is_flag=True, help="Let the seed choose the shear.")
 @click.option("--seed", type=int, default=1, show_default=True, help="Of everything random.")
-@_HOW
-@_OVERWRITE
+@HOW
+@OVERWRITE
 def demo(
     output: str,
     image: str | None,
@@ -331,7 +237,7 @@ def demo(
     run_demo(Path(output), field, inputs, settings, overwrite=overwrite, say=say)
 
 
-@main.command(cls=_Command)
+@main.command(cls=Command)
 @click.option(
     "--galaxy",
     default="vb-spiral",
@@ -354,8 +260,8 @@ def demo(
 @click.option("--method", default="fdnt-ft", show_default=True, help="Shape method.")
 @click.option("-o", "--output", metavar="JSON", help="Result to write: .json.")
 @click.option("--plot", "figure", metavar="FIGURE", help="Plot to write: .png, .pdf or .svg.")
-@_WHERE
-@_OVERWRITE
+@WHERE
+@OVERWRITE
 def ring(output: str | None, figure: str | None, overwrite: bool, **options: Any) -> None:
     """Turn a galaxy through all angles, shear it, and see what shear comes back.
 
@@ -366,7 +272,7 @@ def ring(output: str | None, figure: str | None, overwrite: bool, **options: Any
         click.echo(line)
 
 
-@main.command(cls=_Command)
+@main.command(cls=Command)
 @click.option(
     "--snr",
     default="10,15,20,50",
@@ -412,8 +318,8 @@ def ring(output: str | None, figure: str | None, overwrite: bool, **options: Any
 @click.option("--seed", type=int, default=0, show_default=True, help="Of everything random.")
 @click.option("-o", "--output", metavar="JSON", help="Results to write: .json.")
 @click.option("--plot", "figure", metavar="FIGURE", help="Plot to write: .png, .pdf or .svg.")
-@_WHERE
-@_OVERWRITE
+@WHERE
+@OVERWRITE
 def check(output: str | None, figure: str | None, overwrite: bool, **options: Any) -> None:
     """Put noise on galaxies of known shear, and see what bias it makes.
 
@@ -425,12 +331,15 @@ def check(output: str | None, figure: str | None, overwrite: bool, **options: An
         click.echo(line)
 
 
+main.add_command(great08)
+
+
 @main.group(name="figure")
 def figures() -> None:
     """Draw the figures of the documentation, from nothing."""
 
 
-@figures.command(name="ellipticity-gradient", cls=_Command)
+@figures.command(name="ellipticity-gradient", cls=Command)
 @click.option(
     "-o",
     "--output",
@@ -445,15 +354,15 @@ def figures() -> None:
 @click.option("--angles", type=int, default=16, show_default=True, help="Angles over half a turn.")
 @click.option("--stamp", type=int, default=192, show_default=True, help="Pixels on a side.")
 @click.option("--padding", type=int, default=2, show_default=True, help="Makes the k grid finer.")
-@_WHERE
-@_OVERWRITE
+@WHERE
+@OVERWRITE
 def ellipticity_gradient(output: str, table: str | None, overwrite: bool, **options: Any) -> None:
     """Ring tests of the three galaxies of Bernstein 2010, against the size of the PSF."""
     figure = GradientFigure(**options)
     draw_gradient_figure(figure, output, table, overwrite=overwrite, say=click.echo)
 
 
-@figures.command(name="underfitting", cls=_Command)
+@figures.command(name="underfitting", cls=Command)
 @click.option(
     "-o",
     "--output",
@@ -465,8 +374,8 @@ def ellipticity_gradient(output: str, table: str | None, overwrite: bool, **opti
 @click.option("--table", metavar="TABLE", help="Numbers to write: .json, .ecsv, .fits, .parquet.")
 @click.option("--stamp", type=int, default=128, show_default=True, help="Pixels on a side.")
 @click.option("--padding", type=int, default=1, show_default=True, help="Makes the k grid finer.")
-@_WHERE
-@_OVERWRITE
+@WHERE
+@OVERWRITE
 def underfitting(output: str, table: str | None, overwrite: bool, **options: Any) -> None:
     """Bias and noise of NB07, FDNT-GL and FDNT-FT on Sersic galaxies, as in Bernstein 2010."""
     figure = UnderfittingFigure(**options)

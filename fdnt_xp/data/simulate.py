@@ -9,6 +9,7 @@ is zero.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final
@@ -23,8 +24,6 @@ from fdnt_xp.data.stamps import SMALLEST_STAMP
 from fdnt_xp.errors import FdntValueError, RangeError
 
 if TYPE_CHECKING:
-    from types import ModuleType
-
     from astropy.table import Table
 
 PSF_BETA: Final = 3.0
@@ -101,35 +100,58 @@ def great08_image(
     n_gal = n_x * n_y
     _check(n_gal, cell, shear, snr)
     rng = np.random.default_rng(seed)
-    truth = _draw_population(galsim, rng, n_gal, shear)
-    row, column = np.divmod(np.arange(n_gal), n_x)
-    offsets = _uniform_in_circle(rng, n_gal)
+    truth = truth_table(draw_pairs(rng, n_gal), shear)
+    offsets = draw_offsets(rng, n_gal)
     psf = great08_psf() if psf is None else psf
     image = np.zeros((n_y * cell, n_x * cell))
-    for i, galaxy in enumerate(_galaxies(galsim, truth, shear)):
-        stamp = _draw(galsim, galsim.Convolve([galaxy, psf]), cell, offsets[i])
-        flux = (200.0 if snr is None else snr) * NOISE_SIGMA / math.sqrt(np.sum(stamp**2))
-        truth["flux"][i] = flux
-        y, x = row[i] * cell, column[i] * cell
-        image[y : y + cell, x : x + cell] = flux * stamp
+    galaxies = sheared_galaxies(truth, shear, round_galaxies(SIZE_RATIO, fine_gsparams()))
+    for i, galaxy in enumerate(galaxies):
+        y, x = i // n_x * cell, i % n_x * cell
+        stamp, truth["flux"][i] = draw_stamp(
+            galsim.Convolve([galaxy, psf]), cell, offsets[i], 200.0 if snr is None else snr
+        )
+        image[y : y + cell, x : x + cell] = stamp
     if snr is not None:
         image += NOISE_SIGMA * rng.standard_normal(image.shape)
-    truth["x"][:] = column * cell + 0.5 * (cell - 1) + offsets[:, 0]
-    truth["y"][:] = row * cell + 0.5 * (cell - 1) + offsets[:, 1]
-    psf_image = _draw(galsim, psf, cell, (0.0, 0.0))
+    set_positions(truth, offsets, n_x, cell)
+    psf_image = _draw(psf, cell, (0.0, 0.0))
     return SimulatedField(image=image, psf_image=psf_image / psf_image.sum(), truth=truth)
 
 
-def great08_psf() -> Any:
-    """Return the fiducial PSF of GREAT08 as a GalSim object, without the pixel."""
+def great08_psf(g: tuple[float, float] = PSF_G, *, gsparams: Any = None) -> Any:
+    """Return the fiducial PSF of GREAT08 as a GalSim object, without the pixel.
+
+    Parameters
+    ----------
+    g : tuple of float
+        Another shape for it, (a-b)/(a+b).
+    gsparams : galsim.GSParams, optional
+        Instead of `fine_gsparams`.
+    """
     galsim = load_galsim()
     moffat = galsim.Moffat(
         beta=PSF_BETA,
         fwhm=PSF_FWHM,
         trunc=PSF_TRUNCATION * PSF_FWHM,
-        gsparams=_gsparams(galsim),
+        gsparams=fine_gsparams() if gsparams is None else gsparams,
     )
-    return moffat.shear(g1=PSF_G[0], g2=PSF_G[1])
+    return moffat.shear(g1=g[0], g2=g[1])
+
+
+def fine_gsparams() -> Any:
+    """Return the accuracy of `great08_image`: wings fold back at 1e-5 of the peak."""
+    # The wings of an elongated de Vaucouleurs need transforms beyond GalSim's limit.
+    return load_galsim().GSParams(folding_threshold=2e-3, maximum_fft_size=32768)
+
+
+def quick_gsparams() -> Any:
+    """Return an accuracy for many images: still within 1e-4 of the peak, in a third of the time.
+
+    What is left there is from the end of the PSF's transform, as with `fine_gsparams`.
+    """
+    return load_galsim().GSParams(
+        folding_threshold=2e-2, minimum_fft_size=64, maximum_fft_size=32768
+    )
 
 
 @lru_cache(maxsize=16)
@@ -184,33 +206,67 @@ def density_g(g: NDArray[np.float64]) -> NDArray[np.float64]:
     return density
 
 
-def _draw_population(
-    galsim: ModuleType, rng: np.random.Generator, n_gal: int, shear: tuple[float, float]
-) -> Table:
-    """Make the truth table: shapes in pairs at 90 degrees, spread over the cells at random."""
-    from astropy.table import Table
+@dataclass(frozen=True, kw_only=True)
+class Pairs:
+    """Unsheared shapes in pairs at 90 degrees, spread over the cells at random.
 
+    Parameters
+    ----------
+    shape : array, shape (n_gal, 2), float64
+        (g1, g2) of each, `(a - b)/(a + b)`.
+    number : array, shape (n_gal,), int64
+        Of the pair that it belongs to.
+    turned : array, shape (n_gal,), bool
+        Whether it is the second of its pair: the first, turned by 90 degrees.
+    """
+
+    shape: NDArray[np.float64]
+    number: NDArray[np.int64]
+    turned: NDArray[np.bool_]
+
+
+def draw_pairs(rng: np.random.Generator, n_gal: int) -> Pairs:
+    """Draw the shapes of an even number of galaxies."""
     n_pairs = n_gal // 2
     size, angle = sample_g(rng, n_pairs), rng.uniform(0.0, 2.0 * np.pi, n_pairs)
     first = np.stack([size * np.cos(angle), size * np.sin(angle)], axis=-1)
     order = rng.permutation(n_gal)
-    intrinsic = np.concatenate([first, -first])[order]
-    kinds = np.where(np.arange(n_pairs) % 2 == 0, "exp", "dev")
-    kinds = np.concatenate([kinds, kinds])[order]
-    pairs = np.tile(np.arange(n_pairs), 2)[order]
+    return Pairs(
+        shape=np.concatenate([first, -first])[order],
+        number=np.tile(np.arange(n_pairs), 2)[order],
+        turned=order >= n_pairs,
+    )
+
+
+def draw_offsets(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
+    """Draw (x, y) of centroids from the middle of their cells, shape (n, 2), in pixels."""
+    radius, angle = CENTROID_RADIUS * np.sqrt(rng.uniform(size=n)), rng.uniform(0, 2 * np.pi, n)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
+
+
+def truth_table(pairs: Pairs, shear: tuple[float, float], size_ratio: float = SIZE_RATIO) -> Table:
+    """Make the truth table, one row for each cell; `x`, `y` and `flux` are zero as yet.
+
+    Every second pair is exponential, the others are de Vaucouleurs.
+    """
+    from astropy.table import Table
+
+    galsim = load_galsim()
+    n_gal = len(pairs.number)
+    kinds = np.where(pairs.number % 2 == 0, "exp", "dev")
     applied = galsim.Shear(g1=shear[0], g2=shear[1])
-    lensed = [applied + galsim.Shear(g1=g1, g2=g2) for g1, g2 in intrinsic]
-    radii = {kind: half_light_radius(n) for kind, n in SERSIC_INDICES.items()}
+    lensed = [applied + galsim.Shear(g1=g1, g2=g2) for g1, g2 in pairs.shape]
+    radii = {kind: half_light_radius(n, size_ratio) for kind, n in SERSIC_INDICES.items()}
     columns: dict[str, tuple[Any, str | None, str]] = {
         "id": (np.arange(n_gal), None, "number of the cell, along x first"),
         "x": (np.zeros(n_gal), "pix", "centroid along columns, 0-based"),
         "y": (np.zeros(n_gal), "pix", "centroid along rows, 0-based"),
-        "intrinsic_g1": (intrinsic[:, 0], None, "(a-b)/(a+b) before the shear, component 1"),
-        "intrinsic_g2": (intrinsic[:, 1], None, "(a-b)/(a+b) before the shear, component 2"),
+        "intrinsic_g1": (pairs.shape[:, 0], None, "(a-b)/(a+b) before the shear, component 1"),
+        "intrinsic_g2": (pairs.shape[:, 1], None, "(a-b)/(a+b) before the shear, component 2"),
         "g1": (np.array([s.g1 for s in lensed]), None, "reduced shear shape, component 1"),
         "g2": (np.array([s.g2 for s in lensed]), None, "reduced shear shape, component 2"),
         "kind": (kinds, None, "exp: exponential, dev: de Vaucouleurs"),
-        "pair": (pairs, None, "number of the pair at 90 degrees"),
+        "pair": (pairs.number, None, "number of the pair at 90 degrees"),
         "half_light_radius": (np.vectorize(radii.get)(kinds), "pix", "of the round galaxy"),
         "flux": (np.zeros(n_gal), None, "in units of the image"),
     }
@@ -220,27 +276,66 @@ def _draw_population(
     return table
 
 
-def _galaxies(galsim: ModuleType, truth: Table, shear: tuple[float, float]) -> Any:
-    """Yield each galaxy with unit flux, sheared, centred."""
-    round_ones = {
-        kind: galsim.Sersic(n=n, half_light_radius=half_light_radius(n), gsparams=_gsparams(galsim))
+def set_positions(truth: Table, offsets: NDArray[np.float64], n_x: int, cell: int) -> None:
+    """Write `x` and `y` of galaxies, given from the middle of their cells, into their table."""
+    row, column = np.divmod(np.arange(len(truth)), n_x)
+    truth["x"][:] = column * cell + 0.5 * (cell - 1) + offsets[:, 0]
+    truth["y"][:] = row * cell + 0.5 * (cell - 1) + offsets[:, 1]
+
+
+def round_galaxies(size_ratio: float, gsparams: Any) -> dict[str, Any]:
+    """Return by kind a round galaxy of unit flux whose seen FWHM has the ratio to the PSF's."""
+    galsim = load_galsim()
+    return {
+        kind: galsim.Sersic(
+            n=n, half_light_radius=half_light_radius(n, size_ratio), gsparams=gsparams
+        )
         for kind, n in SERSIC_INDICES.items()
     }
+
+
+def sheared_galaxies(
+    truth: Table, shear: tuple[float, float], round_ones: dict[str, Any]
+) -> Iterator[Any]:
+    """Yield each galaxy of a truth table with unit flux, sheared, centred."""
     for row in truth:
         galaxy = round_ones[row["kind"]].shear(g1=row["intrinsic_g1"], g2=row["intrinsic_g2"])
         yield galaxy.shear(g1=shear[0], g2=shear[1])
 
 
-def _draw(galsim: ModuleType, profile: Any, cell: int, offset: Any) -> NDArray[np.float64]:
-    """Draw a profile with the pixel, moved from the middle of its cell by (x, y) pixels."""
+def draw_stamp(
+    profile: Any, cell: int, offset: Any, snr: float
+) -> tuple[NDArray[np.float64], float]:
+    """Draw a profile of unit flux with the pixel, and give it a signal to noise.
+
+    Parameters
+    ----------
+    profile : galsim.GSObject
+        What is seen, without the pixel.
+    cell : int
+        Pixels on a side.
+    offset : pair of float
+        (x, y) of the centre from the middle of the cell, pixels.
+    snr : float
+        `sqrt(sum of I²)/NOISE_SIGMA` that it gets.
+
+    Returns
+    -------
+    array, shape (cell, cell), float64
+        Without noise.
+    float
+        The flux that it was given.
+    """
+    stamp = _draw(profile, cell, offset)
+    flux = snr * NOISE_SIGMA / math.sqrt(np.sum(stamp**2))
+    return flux * stamp, flux
+
+
+def _draw(profile: Any, cell: int, offset: Any) -> NDArray[np.float64]:
+    galsim = load_galsim()
     stamp = galsim.ImageD(cell, cell)
     profile.drawImage(stamp, scale=1.0, offset=galsim.PositionD(*offset))
     return np.asarray(stamp.array)
-
-
-def _uniform_in_circle(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
-    radius, angle = CENTROID_RADIUS * np.sqrt(rng.uniform(size=n)), rng.uniform(0, 2 * np.pi, n)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
 
 
 def _transform(profile: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -248,11 +343,6 @@ def _transform(profile: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     n, step = 30_000, 0.001
     line = profile.drawKImage(nx=2 * n + 1, ny=1, scale=step).array[0]
     return np.linspace(0.0, n * step, n + 1), np.ascontiguousarray(line[n:].real)
-
-
-def _gsparams(galsim: ModuleType) -> Any:
-    # The wings of an elongated de Vaucouleurs need transforms beyond GalSim's limit.
-    return galsim.GSParams(folding_threshold=2e-3, maximum_fft_size=32768)
 
 
 def _check(n_gal: int, cell: int, shear: tuple[float, float], snr: float | None) -> None:

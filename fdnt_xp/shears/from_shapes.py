@@ -107,6 +107,7 @@ def shear_from_eta(
     weight: ShapeWeight | Function | str = "uniform",
     *,
     eg: Array | None = None,
+    eta_cov: Array | None = None,
     galaxy_weight: Array | None = None,
     cubic: bool = True,
 ) -> ShearEstimate:
@@ -120,11 +121,14 @@ def shear_from_eta(
         As for `shear_from_shapes`.
     eg : array, shape (n_gal,), optional
         Ellipticity gradients.
+    eta_cov : array, shape (n_gal, 2, 2), optional
+        Their covariances by the noise of the pixels, for `g_err_noise`.
 
     Raises
     ------
     ShapeMismatchError, FdntValueError
-        If `eta` has another shape, is not finite; and as `shear_from_shapes`.
+        If `eta` or `eta_cov` has another shape, `eta` is not finite; and as
+        `shear_from_shapes`.
 
     Examples
     --------
@@ -144,8 +148,14 @@ def shear_from_eta(
     finite = xp.isfinite(eta[:, 0]) & xp.isfinite(eta[:, 1])
     if not bool(xp.all(finite)):
         raise FdntValueError("eta must be finite; leave out the galaxies without a shape")
+    if eta_cov is not None:
+        array_namespace(eta=eta, eta_cov=eta_cov)
+        if eta_cov.shape != (eta.shape[0], 2, 2):
+            raise ShapeMismatchError(
+                f"eta_cov must have the shape ({eta.shape[0]}, 2, 2), not {tuple(eta_cov.shape)}"
+            )
     return _estimate(
-        _sample(eta, finite, eg, None, galaxy_weight), as_shape_weight(weight), cubic=cubic
+        _sample(eta, finite, eg, eta_cov, galaxy_weight), as_shape_weight(weight), cubic=cubic
     )
 
 
