@@ -49,11 +49,16 @@ def main() -> None:
     to_array = load_backend(options.backend, options.device, options.dtype).from_numpy
     click.echo(table_header())
     for population, snrs in wanted(options):
-        done_keys = {(r.estimator, r.snr, r.seed, r.padding, r.population) for r in done}
+        alike = (options.seed, options.padding, options.bound, population)
+        known = {
+            (r.estimator, r.snr)
+            for r in done
+            if (r.seed, r.padding, r.bound, r.population) == alike
+        }
         missing = [
             (snr, name)
             for snr, name in product(snrs, options.estimator)
-            if (name, snr, options.seed, options.padding, population) not in done_keys
+            if (name, snr) not in known
         ]
         versions = draw_versions(population) if missing else None
         for snr, name in missing:
@@ -63,6 +68,7 @@ def main() -> None:
                 [name],
                 n_stamps=options.stamps or stamps_for(population.kind, snr),
                 padding=options.padding,
+                bound=options.bound,
                 seed=options.seed,
                 to_array=to_array,
                 quiet=False,
@@ -120,6 +126,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--galaxies", type=int, default=1024)
     parser.add_argument("--stamps", type=int, help="of each result [default: for errors as above]")
     parser.add_argument("--padding", type=int, default=1)
+    parser.add_argument("--bound", type=float, default=0.0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--backend", choices=list(BACKENDS), default="numpy")
     parser.add_argument("--device")
