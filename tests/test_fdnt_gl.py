@@ -20,6 +20,7 @@ from fdnt_xp.errors import (
     ShapeMismatchError,
 )
 from fdnt_xp.flags import Flag, flag_names
+from fdnt_xp.shapes.gl_fit import fit_laguerre
 from fdnt_xp.shapes.methods import shape_method
 from images import PSF_COVARIANCE, galaxies, gaussian_covariance, gaussian_image, star
 from tolerances import tolerance
@@ -188,6 +189,28 @@ def test_elongated_galaxies(transform, padding, xp, to_xp):
     )
     assert_close(shapes.e, to_xp(e), rtol=0, atol=1e-4, xp=xp)
     assert "FINE_GRID" not in names(shapes, 0)
+
+
+def test_whole_stamps_of_large_galaxies(dtype, xp, to_xp, to_np):
+    # Functions 1.14 times as large as the galaxy reach out of the stamp, its own do not.
+    e = np.array([[0.1, 0.0], [0.5, 0.0], [0.0, 0.1]])
+    sigmas = (2.2, 4.0, 4.2)
+    stamps = np.concatenate([galaxies(e[i : i + 1], sigma=s) for i, s in enumerate(sigmas)])
+    psf = fx.Psf.from_image(to_xp(star(), dtype))
+    fit = fit_laguerre(
+        to_xp(stamps, dtype), to_xp(np.ones(stamps.shape), dtype), order=16, scale=1.14
+    )
+    assert to_np(fit.flags == 0).tolist() == [True, False, True]
+    shapes = fx.measure_shapes(to_xp(stamps, dtype), psf, transform="gl", order=16)
+    assert to_np(shapes.measured).tolist() == [True] * 3
+    # The stamp cuts the largest where they are at 1e-5.
+    assert_close(shapes.e, to_xp(e, dtype), rtol=0, atol=1e-4 if "64" in str(dtype) else 5e-3)
+    gap = np.ones(stamps.shape)
+    gap[:, 4, 4] = 0.0
+    shapes = fx.measure_shapes(
+        to_xp(stamps, dtype), psf, ivar=to_xp(gap, dtype), transform="gl", order=16
+    )
+    assert names(shapes, 1) == ["GL_FAILURE"]
 
 
 def test_a_fixed_size_is_kept(measure, xp, to_xp):

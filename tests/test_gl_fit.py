@@ -169,6 +169,25 @@ def test_flux_does_not_matter_and_scale_makes_the_basis_larger(xp, to_xp, to_np)
     assert np.all(np.abs(to_np(bright.coefficients)[:, position(1, 1)]) > 1e3)
 
 
+def test_each_galaxy_may_have_a_scale_of_its_own(dtype, xp, to_xp):
+    stamps, one = to_xp(gaussians(), dtype), to_xp(np.ones((3, SIDE, SIDE)), dtype)
+    scale = np.array([1.0, 1.2, 1.1])
+    fit = fit_laguerre(stamps, one, order=6, scale=to_xp(scale, dtype), chunk_size=2)
+    for i, s in enumerate(scale):
+        alone = fit_laguerre(stamps[i : i + 1, :, :], one[i : i + 1, :, :], order=6, scale=s)
+        tol = {**tolerance("batch", dtype), "xp": xp}
+        assert_close(fit.basis.size[i : i + 1], alone.basis.size, rtol=1e-6, xp=xp)
+        assert_close(fit.coefficients[i, :], alone.coefficients[0, :], **tol)
+
+
+def test_a_scale_that_means_nothing_is_flagged_or_refused(to_xp, to_np):
+    stamps, one = to_xp(gaussians()), to_xp(np.ones((3, SIDE, SIDE)))
+    fit = fit_laguerre(stamps, one, order=4, scale=to_xp(np.array([-1.0, np.nan, 1.0])))
+    assert to_np(fit.flags).tolist() == [int(Flag.GL_FAILURE)] * 2 + [0]
+    with pytest.raises(ShapeMismatchError, match=r"scale must be a number or have the shape \(3,"):
+        fit_laguerre(stamps, one, order=4, scale=to_xp(np.ones(2)))
+
+
 def test_a_start_may_be_given(xp, to_xp, to_np):
     # Two equal galaxies on a stamp: which one is fitted is the caller's choice.
     one, two = (

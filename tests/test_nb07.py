@@ -93,6 +93,7 @@ def test_slopes_of_the_tests(xp, to_xp, to_np):
         drawing=drawing,
         order=10,
         pixels=to_xp((image / np.sqrt(np.sum(image**2))).reshape(1, -1)),
+        weights=to_xp(np.ones((1, SHAPE[0] * SHAPE[1]))),
         length=to_xp(np.array([2.0])),
         size=to_xp(np.array([2.5])),
     )

@@ -12,6 +12,7 @@ from fdnt_xp.app.backends import Backend, load_backend
 from fdnt_xp.app.responses import measure_source_responses
 from fdnt_xp.app.runner import Noise, find_noise, measure_source
 from fdnt_xp.data.images import Pixels, read_image
+from fdnt_xp.data.ivar import IvarSource
 from fdnt_xp.data.provenance import Value, provenance
 from fdnt_xp.data.stamps import StampSource, cube_stamps, grid_stamps, position_stamps
 from fdnt_xp.data.tables import read_positions
@@ -42,6 +43,9 @@ class Inputs:
         Its first pixel's coordinate.
     noise_image : str or None
         FITS file, blank sky: an image, or a cube of stamps.
+    mask, weight : str or None
+        FITS files of the shape of the image: not 0 where a pixel is missing, and the inverse
+        variance of each pixel.
     """
 
     image: str
@@ -53,6 +57,8 @@ class Inputs:
     y_column: str = "y"
     origin: int = 0
     noise_image: str | None = None
+    mask: str | None = None
+    weight: str | None = None
 
     @property
     def layout(self) -> str:
@@ -63,7 +69,8 @@ class Inputs:
 
     def refuse_as_output(self, output: str) -> None:
         """Raise `CatalogError` if the output would replace one of the inputs."""
-        for path in (self.image, self.psf, self.positions, self.noise_image):
+        maps = (self.noise_image, self.mask, self.weight)
+        for path in (self.image, self.psf, self.positions, *maps):
             if path is not None and Path(path).resolve() == Path(output).resolve():
                 raise CatalogError(f"{output} is an input; choose another name for the output")
 
@@ -145,12 +152,19 @@ def measure_files(inputs: Inputs, settings: Settings) -> tuple[Table, float]:
     method = shape_method(settings.method)
     if settings.responses and settings.method != "fdnt-ft":
         raise FdntValueError("--method chooses how shapes are measured, not --responses")
+    if settings.responses and (inputs.mask or inputs.weight):
+        raise FdntValueError("--mask and --weight are for shapes, not for --responses")
     source = open_source(inputs)
+    mask = _open_beside(source, inputs.mask, "mask")
+    weight = _open_beside(source, inputs.weight, "weight map")
     psf_pixels: Pixels = read_image(inputs.psf, ndim=(2, 3), what="PSF image")
     blank = None
     if inputs.noise_image is not None:
         blank = read_image(inputs.noise_image, ndim=(2, 3), what="noise image")
-    noise = find_noise(source, settings.noise_variance, blank)
+    noise = find_noise(source, settings.noise_variance, blank, mask=mask, mapped=weight is not None)
+    ivar = None
+    if mask is not None or weight is not None:
+        ivar = IvarSource(mask=mask, weight=weight, variance=noise.variance)
     start = time.perf_counter()
     if settings.responses:
         table = measure_source_responses(
@@ -171,6 +185,7 @@ def measure_files(inputs: Inputs, settings: Settings) -> tuple[Table, float]:
             backend=backend,
             method=method,
             noise_variance=noise.variance,
+            ivar=ivar,
             oversampling=settings.oversampling,
             size=settings.size,
             chunk=settings.chunk,
@@ -179,6 +194,13 @@ def measure_files(inputs: Inputs, settings: Settings) -> tuple[Table, float]:
     seconds = time.perf_counter() - start
     table.meta = _facts(inputs, settings, backend, noise, table.meta.get("RSTEP"))
     return table, seconds
+
+
+def _open_beside(source: StampSource, path: str | None, what: str) -> StampSource | None:
+    """Open a map of the shape of the image."""
+    if path is None:
+        return None
+    return source.beside(read_image(path, ndim=(2, 3), what=what), what)
 
 
 def _facts(
@@ -206,6 +228,8 @@ def _facts(
         noiseerr=noise.relative_err,
         noisesrc=noise.origin,
         noiseimg=inputs.noise_image,
+        maskimg=inputs.mask,
+        ivarimg=inputs.weight,
         noisecor=noise.power is not None if settings.responses else None,
         bordlvl=noise.border.level if noise.border else None,
         wtsize=settings.size,

@@ -15,6 +15,7 @@ from tqdm import tqdm
 from fdnt_xp.app.backends import Backend
 from fdnt_xp.arrays import Array
 from fdnt_xp.data.images import Pixels, native_pixels
+from fdnt_xp.data.ivar import IvarSource
 from fdnt_xp.data.noise import BorderNoise, measure_border_noise
 from fdnt_xp.data.noise_power import NoisePower, measure_noise_power, noise_stamps
 from fdnt_xp.data.stamps import StampChunk, StampSource
@@ -48,15 +49,20 @@ class Noise:
         What it was measured from: the borders of the stamps,
     blank : NoisePower, optional
         or blank stamps; it was given if both are None.
+    mapped : bool
+        Whether a map has it for each pixel; there is no number then.
     """
 
     variance: float | None
     border: BorderNoise | None = None
     blank: NoisePower | None = None
+    mapped: bool = False
 
     @property
     def origin(self) -> str:
         """Where the number came from."""
+        if self.mapped:
+            return "weight map"
         if self.blank is not None:
             return "noise image"
         return "given" if self.border is None else "stamp borders"
@@ -76,7 +82,12 @@ class Noise:
 
 
 def find_noise(
-    source: StampSource, given: float | None = None, blank: Pixels | None = None
+    source: StampSource,
+    given: float | None = None,
+    blank: Pixels | None = None,
+    *,
+    mask: StampSource | None = None,
+    mapped: bool = False,
 ) -> Noise:
     """Return the variance given, or the noise of blank sky, or that of the stamps' borders.
 
@@ -90,7 +101,18 @@ def find_noise(
         Variance of a pixel.
     blank : array, shape (height, width) or (n, ny, nx), optional
         Image of noise, or stamps of it of the shape of those of the source.
+    mask : StampSource, optional
+        Beside the source; pixels of the borders where it is not 0 are left out.
+    mapped : bool
+        Whether a map has the inverse variance of each pixel, so that none is to be found.
     """
+    if mapped and (given is not None or blank is not None):
+        raise FdntValueError(
+            "--weight says what the noise of each pixel is: give no --noise-variance and no "
+            "--noise-image with it"
+        )
+    if mapped:
+        return Noise(variance=None, mapped=True)
     if given is not None and blank is not None:
         raise FdntValueError("give --noise-variance or --noise-image, not both")
     if given is not None:
@@ -100,7 +122,7 @@ def find_noise(
     if blank is not None:
         measured = measure_noise_power(_blank_stamps(blank, source.stamp_shape))
         return Noise(variance=measured.variance, blank=measured)
-    border = measure_border_noise(source)
+    border = measure_border_noise(source, mask)
     if border.has_background:
         warnings.warn(
             f"the borders of the stamps are not at zero but at {border.level:.4g} +- "
@@ -125,6 +147,7 @@ def measure_source(
     *,
     backend: Backend,
     noise_variance: float | None,
+    ivar: IvarSource | None = None,
     method: ShapeMethod = measure_shapes,
     oversampling: int = 1,
     size: float | None = None,
@@ -142,7 +165,9 @@ def measure_source(
     backend : Backend
         Where to compute.
     noise_variance : float or None
-        Per pixel.
+        Per pixel; not looked at if there is an `ivar`.
+    ivar : IvarSource, optional
+        Inverse variance of each pixel.
     method : callable
         One of `fdnt_xp.shapes.methods`.
     oversampling : int
@@ -165,8 +190,11 @@ def measure_source(
         If there are PSFs for another number of galaxies.
     """
 
-    def measure(_: StampChunk, stamps: Array, psf: Psf) -> Table:
-        return method(stamps, psf, noise_variance=noise_variance, size=size).to_table()
+    def measure(part: StampChunk, stamps: Array, psf: Psf) -> Table:
+        if ivar is None:
+            return method(stamps, psf, noise_variance=noise_variance, size=size).to_table()
+        weighted = backend.from_numpy(ivar.read(part))
+        return method(stamps, psf, ivar=weighted, size=size).to_table()
 
     psfs = ChunkPsfs.of(psf_pixels, source, backend, oversampling)
     return measure_chunks(source, psfs, measure, chunk=chunk, quiet=quiet)

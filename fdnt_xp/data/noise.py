@@ -65,13 +65,14 @@ class BorderNoise:
         return abs(self.level) > max(5.0 * self.level_err, 0.1 * noise) and self.known
 
 
-def measure_border_noise(source: StampSource) -> BorderNoise:
+def measure_border_noise(source: StampSource, mask: StampSource | None = None) -> BorderNoise:
     """Measure the noise by the median absolute deviation of the stamps' border pixels.
 
     The border is a sixteenth of the stamp wide. All stamps are pooled, or 2000 of them
-    evenly spread, so that a few bright neighbours, however bright, change nothing.
+    evenly spread, so that a few bright neighbours, however bright, change nothing. Pixels
+    where `mask`, a source beside the other, is not 0 are left out.
     """
-    groups = [group for group in _border_pixels(source) if group.size]
+    groups = [group for group in _border_pixels(source, mask) if group.size]
     n_pixels = sum(group.size for group in groups)
     if n_pixels == 0:
         nan = math.nan
@@ -99,7 +100,7 @@ def _level_and_variance(pixels: NDArray[np.float64]) -> tuple[float, float]:
     return level, float(SIGMA_PER_MAD * np.median(np.abs(pixels - level))) ** 2
 
 
-def _border_pixels(source: StampSource) -> list[NDArray[np.float64]]:
+def _border_pixels(source: StampSource, mask: StampSource | None) -> list[NDArray[np.float64]]:
     """Return the finite border pixels of whole stamps, of a fair sample of them, in groups."""
     rows = np.flatnonzero(source.flags == 0)
     if len(rows) > _MOST_STAMPS:
@@ -109,5 +110,11 @@ def _border_pixels(source: StampSource) -> list[NDArray[np.float64]]:
     border = np.ones((ny, nx), dtype=bool)
     border[width : ny - width, width : nx - width] = False
     groups = np.array_split(rows, min(_GROUPS, max(len(rows), 1)))
-    parts = [source.take(group)[:, border].ravel().astype(np.float64) for group in groups]
-    return [pixels[np.isfinite(pixels)] for pixels in parts]
+    parts = []
+    for group in groups:
+        pixels = source.take(group)[:, border].astype(np.float64)
+        there = np.isfinite(pixels)
+        if mask is not None:
+            there &= mask.take(group)[:, border] == 0
+        parts.append(pixels[there])
+    return parts

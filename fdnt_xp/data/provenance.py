@@ -36,6 +36,8 @@ COMMENTS: Final[dict[str, str]] = {
     "NOISEERR": "its relative standard error",
     "NOISESRC": "where that number came from",
     "NOISEIMG": "image of blank sky it was measured on",
+    "IVARIMG": "map of the inverse variance of each pixel",
+    "MASKIMG": "image of missing pixels",
     "NOISECOR": "whether noise was taken for correlated",
     "BORDLVL": "median of the stamps' border pixels",
     "WTSIZE": "[pix] weight size, if it was fixed",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -86,6 +86,27 @@ class StampSource:
             if self.flags[row] == 0:
                 stamps[place] = self._cut(int(row))
         return stamps
+
+    def beside(self, pixels: Pixels, what: str) -> StampSource:
+        """Return the source that cuts other pixels where this one cuts its own.
+
+        Parameters
+        ----------
+        pixels : array, of the shape of the image or cube
+        what : str
+            What they are to the caller, for messages.
+
+        Raises
+        ------
+        ShapeMismatchError
+            If they have another shape.
+        """
+        if pixels.shape != self.pixels.shape:
+            raise ShapeMismatchError(
+                f"the {what} has the shape {pixels.shape}; it must have that of the image, "
+                f"{self.pixels.shape}"
+            )
+        return replace(self, pixels=pixels)
 
     def chunks(self, size: int) -> Iterator[StampChunk]:
         """Yield all galaxies in order, `size` at a time."""

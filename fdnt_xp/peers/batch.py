@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, TypeAlias
 
-from fdnt_xp.arrays import Array, array_namespace, device_of, has_any
+from fdnt_xp.arrays import Array, DType, array_namespace, device_of, has_any
 from fdnt_xp.flags import FAILED, Flag
 from fdnt_xp.fourier.psf import Psf
 from fdnt_xp.nulltests.dogleg import Status
-from fdnt_xp.shapes.job import check_options, check_stamps, screen
-from fdnt_xp.shapes.pixels import noise_column
+from fdnt_xp.shapes.job import check_options, check_stamps
+from fdnt_xp.shapes.pixels import Pixels, check_pixels
 from fdnt_xp.shapes.results import ShapeResult
 
 MOST_ELLIPTICAL: Final = 4.0
@@ -22,8 +22,50 @@ LARGEST: Final = 0.5
 """Largest size, in sides of the stamp."""
 _BYTES_AT_ONCE: Final = 128e6
 
-MeasureRows: TypeAlias = "Callable[[Array, Psf, Array, Array], ShapeResult]"
-"""From clean stamps, their PSFs, noise variances and flags to shapes."""
+MeasureRows: TypeAlias = "Callable[[Weighted, Psf, Array], ShapeResult]"
+"""From clean pixels, their PSFs and flags to shapes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Weighted:
+    """Pixels and what each counts in a fit.
+
+    Parameters
+    ----------
+    stamps : array, shape (n_gal, ny, nx)
+        Finite; 0 where missing.
+    weights : array, shape (n_gal, ny, nx), optional
+        Inverse variance over the largest of the stamp: 0 where missing, 1 at most. None if
+        all count alike.
+    noise : array, shape (n_gal,)
+        Variance of a pixel of weight 1; NaN if unknown.
+    """
+
+    stamps: Array
+    weights: Array | None
+    noise: Array
+
+    @classmethod
+    def of(cls, pixels: Pixels) -> Weighted:
+        """Return screened pixels, weighted by their inverse variance if they have one."""
+        if pixels.ivar is None:
+            return cls(stamps=pixels.stamps, weights=None, noise=pixels.variance)
+        xp = array_namespace(stamps=pixels.stamps)
+        best = xp.max(xp.max(pixels.ivar, axis=-1), axis=-1)
+        best = xp.where(best > 0, best, xp.ones_like(best))
+        return cls(
+            stamps=pixels.stamps, weights=pixels.ivar / best[:, None, None], noise=1.0 / best
+        )
+
+    def astype(self, dtype: DType) -> Weighted:
+        """Return the same in another precision."""
+        xp = array_namespace(stamps=self.stamps)
+        weights = None if self.weights is None else xp.astype(self.weights, dtype)
+        return Weighted(
+            stamps=xp.astype(self.stamps, dtype),
+            weights=weights,
+            noise=xp.astype(self.noise, dtype),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +75,7 @@ class Fitted:
     Parameters
     ----------
     eta, eta_cov : array, shapes (n_gal, 2) and (n_gal, 2, 2)
-        Shape, and its covariance for a noise variance of 1 of a pixel.
+        Shape, and its covariance for a noise variance of 1 of a pixel of weight 1.
     centroid : array, shape (n_gal, 2)
         Pixels from the centre of the stamp.
     size, flux, flux_variance : array, shape (n_gal,)
@@ -60,6 +102,7 @@ def measure_in_chunks(
     psf: Psf,
     *,
     noise_variance: float | Array | None,
+    ivar: Array | None,
     size: float | None,
     padding: int,
     chunk_size: int | None,
@@ -67,7 +110,7 @@ def measure_in_chunks(
 ) -> ShapeResult:
     """Check a call, and measure chunk by chunk; see `measure_shapes` for what is asked."""
     xp, stamps = check_stamps(stamps, psf)
-    noise = noise_column(xp, noise_variance, stamps)
+    pixels = check_pixels(xp, stamps, noise_variance, ivar)
     check_options(size=size, padding=padding, chunk_size=chunk_size)
     n_gal = int(stamps.shape[0])
     if n_gal == 0:
@@ -79,8 +122,10 @@ def measure_in_chunks(
         stop = min(start + n_chunk, n_gal)
         rows = xp.arange(start, stop, dtype=xp.int64, device=device)
         mine = psf if psf.n_psf == 1 else psf.take(rows)
-        clean, flags = screen(stamps[start:stop, :, :], mine)
-        parts.append(measure(clean, mine, noise[start:stop], flags))
+        here = pixels.take(slice(start, stop))
+        clean, flags = here.screened(mine)
+        shapes = measure(Weighted.of(clean), mine, flags)
+        parts.append(replace(shapes, masked_fraction=here.masked_fraction()))
     return ShapeResult.concat(parts)
 
 
@@ -101,7 +146,7 @@ def shapes_of(
     ----------
     fit : Fitted
     noise : array, shape (n_gal,)
-        Variance of a pixel; NaN if unknown.
+        Variance of a pixel of weight 1; NaN if unknown.
     flags : array, shape (n_gal,), int32
         What is known of each galaxy so far.
     stamp_shape : tuple of int

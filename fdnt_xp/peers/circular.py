@@ -3,7 +3,7 @@
 The model is `sum_a c_a psi_a(S_eta^-1 (x - x0)/r) (x) T`, with all components of one centre,
 shape and size r: sums of Gaussians of fixed ratios of sizes, 1 : 2.5 : 6.25 : ... (Kuijken
 1999; Voigt and Bridle 2010), the exponential disc, de Vaucouleurs' law (lensfit, Miller et al.
-2007). Maximum of the likelihood for white noise.
+2007). Maximum of the likelihood for independent Gaussian noise, white or known pixel by pixel.
 
 Unbiased where the galaxy is such a model, and only there: B10 §3.
 """
@@ -16,7 +16,7 @@ from typing import Final
 
 from fdnt_xp.arrays import Array, array_namespace
 from fdnt_xp.fourier.psf import Psf
-from fdnt_xp.peers.batch import measure_in_chunks, shapes_of
+from fdnt_xp.peers.batch import Weighted, measure_in_chunks, shapes_of
 from fdnt_xp.peers.drawing import Drawing
 from fdnt_xp.peers.image_fit import ImageFit, fit_images
 from fdnt_xp.peers.profiles import GAUSSIAN_RATIO, Profile, de_vaucouleurs, exponential, gaussians
@@ -58,6 +58,7 @@ class CircularMethod:
         psf: Psf,
         *,
         noise_variance: float | Array | None = None,
+        ivar: Array | None = None,
         size: float | None = None,
         padding: int = 1,
         chunk_size: int | None = None,
@@ -65,18 +66,21 @@ class CircularMethod:
         """Measure the galaxy on each stamp; see `measure_shapes` for the arguments."""
         shape = (int(stamps.shape[-2]), int(stamps.shape[-1])) if stamps.ndim == 3 else (1, 1)
 
-        def measure(stamps: Array, psf: Psf, noise: Array, flags: Array) -> ShapeResult:
-            xp = array_namespace(stamps=stamps)
-            drawing = Drawing.through(xp, psf, shape, self.finer * padding, stamps.dtype)
-            problem = ImageFit.of(drawing, self.profile, stamps, size=size)
+        def measure(pixels: Weighted, psf: Psf, flags: Array) -> ShapeResult:
+            xp = array_namespace(stamps=pixels.stamps)
+            drawing = Drawing.through(xp, psf, shape, self.finer * padding, pixels.stamps.dtype)
+            problem = ImageFit.of(
+                drawing, self.profile, pixels.stamps, weights=pixels.weights, size=size
+            )
             fit = fit_images(problem, self.start, self.max_iter)
-            return shapes_of(fit, noise, flags, stamp_shape=shape, fixed=size is not None)
+            return shapes_of(fit, pixels.noise, flags, stamp_shape=shape, fixed=size is not None)
 
         return measure_in_chunks(
             measure,
             stamps,
             psf,
             noise_variance=noise_variance,
+            ivar=ivar,
             size=size,
             padding=padding,
             chunk_size=chunk_size,

@@ -30,7 +30,10 @@ class ImageFit:
     drawing : Drawing
     profile : Profile
     pixels : array, shape (n_gal, ny nx)
-        Divided by `norm`, so that the sum of their squares is 1.
+        Times the roots of their weights, and divided by `norm`, so that the sum of their
+        squares is 1.
+    roots : array, shape (n_gal, ny nx), or None
+        Of the weights, 0 where a pixel is missing; None if all weigh 1.
     norm : array, shape (n_gal,)
     centre : array, shape (n_gal, 2)
         First centroid by moments, pixels from the centre of the stamp.
@@ -43,6 +46,7 @@ class ImageFit:
     drawing: Drawing
     profile: Profile
     pixels: Array
+    roots: Array | None
     norm: Array
     centre: Array
     length: Array
@@ -50,24 +54,32 @@ class ImageFit:
 
     @classmethod
     def of(
-        cls, drawing: Drawing, profile: Profile, stamps: Array, *, size: float | None
+        cls,
+        drawing: Drawing,
+        profile: Profile,
+        stamps: Array,
+        *,
+        weights: Array | None = None,
+        size: float | None,
     ) -> ImageFit:
-        """Return the fit of stamps with finite pixels."""
+        """Return the fit of stamps with finite pixels; weights are 1 at most, 0 where missing."""
         xp = array_namespace(stamps=stamps)
         pixels = xp.reshape(stamps, (int(stamps.shape[0]), -1))
         brightest = xp.max(xp.abs(pixels), axis=-1)
         unit = xp.where(brightest > 0, brightest, xp.ones_like(brightest))
         # In two steps: the square of a small number underflows.
         scaled = pixels / unit[:, None]
+        there = xp.ones_like(stamps) if weights is None else weights
+        centre, length = starting_moments(xp.reshape(scaled, stamps.shape), there)
+        roots = None if weights is None else xp.reshape(xp.sqrt(weights), pixels.shape)
+        scaled = scaled if roots is None else roots * scaled
         norm = xp.sqrt(xp.sum(scaled * scaled, axis=-1))
         norm = xp.where(norm > 0, norm, xp.ones_like(norm))
-        scaled = scaled / norm[:, None]
-        image = xp.reshape(scaled, stamps.shape)
-        centre, length = starting_moments(image, xp.ones_like(image))
         return cls(
             drawing=drawing,
             profile=profile,
-            pixels=scaled,
+            pixels=scaled / norm[:, None],
+            roots=roots,
             norm=norm * unit,
             centre=centre,
             length=length,
@@ -79,7 +91,8 @@ class ImageFit:
         xp = array_namespace(rows=rows)
         names = ("pixels", "norm", "centre", "length")
         columns = {name: xp.take(getattr(self, name), rows, axis=0) for name in names}
-        return replace(self, drawing=self.drawing.take(rows), **columns)
+        roots = None if self.roots is None else xp.take(self.roots, rows, axis=0)
+        return replace(self, drawing=self.drawing.take(rows), roots=roots, **columns)
 
     def start(self, ratio: float) -> Array:
         """Return where to start: round, the size a part of the observed one; (n_gal, 5)."""
@@ -117,11 +130,12 @@ class ImageFit:
         )
         centroid = xp.where(sane[:, None], centroid, xp.zeros_like(centroid))
         model = Model.at(self.drawing, self.profile, centroid, form.values)
-        images = model.draw_components()
+        images = self._weighted(model.draw_components())
         inverse, regular = inverse_of_normal(_products(images, images))
         amplitudes, residual = self._amplitudes(images, inverse)
-        slopes = model.draw_slopes(amplitudes)
-        first, second = model.overlaps(residual, amplitudes)
+        slopes = self._weighted(model.draw_slopes(amplitudes))
+        pull = residual if self.roots is None else self.roots * residual
+        first, second = model.overlaps(pull, amplitudes)
 
         shared = _products(slopes, images)
         h = _products(slopes, slopes) - second
@@ -144,8 +158,19 @@ class ImageFit:
             square=xp.sum((self.pixels - residual) ** 2, axis=-1),
         )
 
+    def _weighted(self, images: Array) -> Array:
+        """Return images, (n_gal, n, n_pix), as they count."""
+        return images if self.roots is None else self.roots[:, None, :] * images
+
+    def enough(self) -> Array:
+        """Return where there are more pixels than parameters, shape (n_gal,), bool."""
+        xp = array_namespace(pixels=self.pixels)
+        there = xp.ones_like(self.pixels) if self.roots is None else self.roots
+        n_pixels = xp.sum(xp.astype(there > 0, xp.int32), axis=-1, dtype=xp.int32)
+        return n_pixels > 5 + self.profile.n_components
+
     def _amplitudes(self, images: Array, inverse: Array) -> tuple[Array, Array]:
-        """Return the best amplitudes, (n_gal, n_component), and data minus model."""
+        """Return the best amplitudes, (n_gal, n_component), and data minus model, weighted."""
         xp = array_namespace(images=images)
         residual = self.pixels
         total = xp.zeros_like(inverse[:, 0, :])
@@ -183,10 +208,10 @@ class Expansion:
         Minus half the gradient, and half the second derivative.
     normal, noise : array, shape (n_gal, 5, 5)
         `Jᵀ J` of the slopes with the amplitudes marginalised over, and the covariance of g for
-        pixels of noise 1; one and the same where the model fits.
+        noise 1 of pixels of weight 1; one and the same where the model fits.
     amplitudes : array, shape (n_gal, n_component)
     square : array, shape (n_gal,)
-        Sum of the squares of the model.
+        Sum of the squares of the model, weighted.
     """
 
     chi2: Array
@@ -223,7 +248,7 @@ def fit_images(problem: ImageFit, start: float, max_iter: int) -> Fitted:
         size=size,
         flux=problem.norm * total,
         flux_variance=total**2 / xp.where(seen, at.square, xp.ones_like(total)),
-        regular=regular & seen,
+        regular=regular & seen & problem.enough(),
         status=found.status,
         n_eval=found.n_eval,
     )

@@ -28,7 +28,7 @@ from fdnt_xp.arrays import Array, array_namespace, device_of
 from fdnt_xp.fourier.psf import Psf
 from fdnt_xp.nulltests.dogleg import DoglegOptions, Status, find_root, newton_step
 from fdnt_xp.nulltests.tests import inverse_if_positive
-from fdnt_xp.peers.batch import Fitted, in_domain, measure_in_chunks, shapes_of
+from fdnt_xp.peers.batch import Fitted, Weighted, in_domain, measure_in_chunks, shapes_of
 from fdnt_xp.peers.circular import CIRCULAR_METHODS
 from fdnt_xp.peers.drawing import Drawing
 from fdnt_xp.peers.image_fit import ImageFit
@@ -40,7 +40,7 @@ from fdnt_xp.shapes.laguerre import (
     n_coefficients,
     position,
 )
-from fdnt_xp.shapes.least_squares import LinearFit, least_squares
+from fdnt_xp.shapes.least_squares import LARGEST_WITH_GAPS, LinearFit, least_squares
 from fdnt_xp.shapes.results import ShapeResult
 
 FINER: Final = 2
@@ -81,6 +81,7 @@ class Nb07Method:
         psf: Psf,
         *,
         noise_variance: float | Array | None = None,
+        ivar: Array | None = None,
         size: float | None = None,
         padding: int = 1,
         chunk_size: int | None = None,
@@ -89,36 +90,31 @@ class Nb07Method:
         shape = (int(stamps.shape[-2]), int(stamps.shape[-1])) if stamps.ndim == 3 else (1, 1)
         n_modes = (FINER * padding) ** 2 * shape[0] * shape[1]
 
-        def measure(stamps: Array, psf: Psf, noise: Array, flags: Array) -> ShapeResult:
-            xp = array_namespace(stamps=stamps)
+        def measure(pixels: Weighted, psf: Psf, flags: Array) -> ShapeResult:
+            xp = array_namespace(stamps=pixels.stamps)
             drawing = Drawing.through(xp, psf, shape, FINER * padding, xp.float64)
-            wide = xp.astype(stamps, xp.float64)
+            wide = pixels.astype(xp.float64)
             fit = self._fit(drawing, wide, size)
-            shapes = shapes_of(
-                fit,
-                xp.astype(noise, xp.float64),
-                flags,
-                stamp_shape=shape,
-                fixed=size is not None,
-            )
-            return _in_precision(shapes, stamps)
+            shapes = shapes_of(fit, wide.noise, flags, stamp_shape=shape, fixed=size is not None)
+            return _in_precision(shapes, pixels.stamps)
 
         return measure_in_chunks(
             measure,
             stamps,
             psf,
             noise_variance=noise_variance,
+            ivar=ivar,
             size=size,
             padding=padding,
             chunk_size=chunk_size,
             numbers_a_galaxy=3 * n_coefficients(self.order + 2) * n_modes,
         )
 
-    def _fit(self, drawing: Drawing, stamps: Array, size: float | None) -> Fitted:
+    def _fit(self, drawing: Drawing, data: Weighted, size: float | None) -> Fitted:
         """Size the basis, start from the Gaussian of the greatest likelihood, solve the tests."""
-        xp = array_namespace(stamps=stamps)
+        xp = array_namespace(stamps=data.stamps)
         gaussian = CIRCULAR_METHODS["gauss-1"]
-        first = ImageFit.of(drawing, gaussian.profile, stamps, size=None)
+        first = ImageFit.of(drawing, gaussian.profile, data.stamps, weights=data.weights, size=None)
         at = find_minimum(first, first.start(gaussian.start), max_iter=gaussian.max_iter)
         seen = replace(first, drawing=drawing.without_psf())
         as_seen = find_minimum(seen, seen.start(1.0), max_iter=gaussian.max_iter)
@@ -128,7 +124,8 @@ class Nb07Method:
         tests = ConvolvedTests(
             drawing=drawing,
             order=self.order,
-            pixels=first.pixels,
+            pixels=xp.reshape(data.stamps, first.pixels.shape) / first.norm[:, None],
+            weights=xp.ones_like(first.pixels) if first.roots is None else first.roots**2,
             length=first.length,
             size=sigma,
         )
@@ -140,6 +137,9 @@ class Nb07Method:
         b00 = fit.coefficients[:, 0]
         to_flux = first.norm * sigma * (2.0 * np.pi**0.5)
         covariance, regular = _covariance(root.jac, fit)
+        regular = regular & (fit.inflation < LARGEST_INFLATION)
+        if data.weights is not None:
+            regular = regular & (tests.growth(root.x, fit) < LARGEST_WITH_GAPS)
         lost = as_seen.status != int(Status.CONVERGED)
         return Fitted(
             eta=root.x[:, 2:],
@@ -148,7 +148,7 @@ class Nb07Method:
             size=sigma,
             flux=b00 * to_flux,
             flux_variance=fit.covariance[:, 0, 0] * (to_flux / first.norm) ** 2,
-            regular=regular & (fit.inflation < LARGEST_INFLATION),
+            regular=regular,
             status=xp.where(lost, as_seen.status, root.status),
             n_eval=root.n_eval + at.n_eval + as_seen.n_eval,
         )
@@ -162,8 +162,8 @@ class ConvolvedTests:
     ----------
     drawing : Drawing
     order : int
-    pixels : array, shape (n_gal, n_pix)
-        The sum of their squares is 1.
+    pixels, weights : array, shape (n_gal, n_pix)
+        The sum of the squares of the pixels, weighted, is 1.
     length, size : array, shape (n_gal,)
         L and sigma, pixels.
     """
@@ -171,6 +171,7 @@ class ConvolvedTests:
     drawing: Drawing
     order: int
     pixels: Array
+    weights: Array
     length: Array
     size: Array
 
@@ -181,6 +182,7 @@ class ConvolvedTests:
             self,
             drawing=self.drawing.take(rows),
             pixels=xp.take(self.pixels, rows, axis=0),
+            weights=xp.take(self.weights, rows, axis=0),
             length=xp.take(self.length, rows, axis=0),
             size=xp.take(self.size, rows, axis=0),
         )
@@ -209,15 +211,34 @@ class ConvolvedTests:
         drawn = self._drawn(basis)
         n = n_coefficients(self.order)
         functions = drawn[:, :n, :]
-        fit = least_squares(functions, self.pixels, xp.ones_like(self.pixels))
+        fit = least_squares(functions, self.pixels, self.weights)
         like = {"dtype": x.dtype, "device": device_of(x)}
         matrix = xp.asarray(_generators_of(self.order), **like)
         n_wide = int(drawn.shape[1])
         moved = xp.reshape(xp.matmul(fit.coefficients, matrix), (-1, 6, n_wide))
         changes = xp.matmul(basis.moves(self.length)[:, :4, :], moved)
-        images = xp.matmul(changes, drawn)
+        images = self.weights[:, None, :] * xp.matmul(changes, drawn)
         right = xp.matmul(images, xp.matrix_transpose(functions))
         return fit, xp.matmul(right, fit.covariance), sane
+
+    def growth(self, x: Array, fit: LinearFit) -> Array:
+        """Return how much more gaps and weights inflate a variance than the PSF does, (n_gal,).
+
+        The inflation of a whole stamp is that of functions which the PSF made alike.
+        """
+        xp = array_namespace(x=x)
+        basis, _ = self._basis(x)
+        functions = self._drawn(basis)[:, : n_coefficients(self.order), :]
+        even = xp.ones_like(self.weights)
+        whole = least_squares(functions, self.pixels, even)
+        squares = functions**2
+        ours, theirs = (
+            xp.linalg.diagonal(one.covariance) * xp.sum(weights[:, None, :] * squares, axis=-1)
+            for one, weights in ((fit, self.weights), (whole, even))
+        )
+        seen = theirs > 0
+        growth = ours / xp.where(seen, theirs, xp.ones_like(theirs))
+        return xp.max(xp.where(seen, growth, xp.full_like(growth, float("inf"))), axis=-1)
 
     def _basis(self, x: Array) -> tuple[LaguerreBasis, Array]:
         """Return a basis two orders higher, a unit circle where absurd, and where it is not."""

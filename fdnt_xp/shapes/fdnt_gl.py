@@ -10,14 +10,18 @@ from __future__ import annotations
 from typing import Final
 
 from fdnt_xp.arrays import Array, array_namespace
+from fdnt_xp.flags import Flag
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.transform import DeconvolvedStamps, mode_phase
 from fdnt_xp.shapes.gl_fit import LaguerreFit, fit_laguerre
 from fdnt_xp.shapes.pixels import Pixels
 
-BASIS_SCALE: Final = 1.1
-"""Size of the basis over the matched one. A larger one follows the wings of n = 2 and 4 better, and
-n = 1 behind a mask worse (docs, "Gauss-Laguerre fits")."""
+SCALE_OF_WHOLE: Final = 1.14
+SCALE_WITH_GAPS: Final = 1.09
+"""Size of the basis over the matched one, by whether pixels are missing. A larger one follows
+the wings of n = 2 and 4 better, and n = 1 behind a mask worse (docs, "Gauss-Laguerre fits")."""
+SCALE_OF_LARGE: Final = 1.0
+"""That of whole stamps that do not hold the functions of the larger one."""
 
 
 def fit_pixels_of(pixels: Pixels, order: int) -> LaguerreFit:
@@ -30,7 +34,28 @@ def fit_pixels_of(pixels: Pixels, order: int) -> LaguerreFit:
     """
     xp = array_namespace(stamps=pixels.stamps)
     ivar = xp.ones_like(pixels.stamps) if pixels.ivar is None else pixels.ivar
-    return fit_laguerre(pixels.stamps, ivar, order=order, scale=BASIS_SCALE)
+    whole = pixels.masked_fraction() == 0
+    scale = xp.where(
+        whole,
+        xp.full_like(pixels.variance, SCALE_OF_WHOLE),
+        xp.full_like(pixels.variance, SCALE_WITH_GAPS),
+    )
+    fit = fit_laguerre(pixels.stamps, ivar, order=order, scale=scale)
+    # A gap that the larger functions cannot be told apart behind must not pass by smaller ones.
+    cut_off = whole & (fit.flags == int(Flag.GL_FAILURE))
+    # A host read: how many are to be fitted again decides the size of that batch.
+    n_again = int(xp.sum(xp.astype(cut_off, xp.int32)))
+    if n_again == 0:
+        return fit
+    place = xp.argsort(xp.astype(~cut_off, xp.int32), stable=True)
+    rows = place[:n_again]
+    again = fit_laguerre(
+        xp.take(pixels.stamps, rows, axis=0),
+        xp.take(ivar, rows, axis=0),
+        order=order,
+        scale=SCALE_OF_LARGE,
+    )
+    return LaguerreFit.concat([again, fit.take(place[n_again:])]).take(xp.argsort(place))
 
 
 def deconvolve_fit(fit: LaguerreFit, inverse_transfer: Array, grid: KGrid) -> DeconvolvedStamps:

@@ -34,7 +34,7 @@ from fdnt_xp.shapes.laguerre import (
     n_coefficients,
     pixel_positions,
 )
-from fdnt_xp.shapes.least_squares import LARGEST_INFLATION
+from fdnt_xp.shapes.least_squares import LARGEST_INFLATION, LARGEST_WITH_GAPS
 
 _BYTES_AT_ONCE: Final = 128e6
 
@@ -132,7 +132,7 @@ def fit_laguerre(
     centroid: Array | None = None,
     size: Array | None = None,
     matched: bool = True,
-    scale: float = 1.0,
+    scale: float | Array = 1.0,
     max_iter: int = 40,
     chunk_size: int | None = None,
 ) -> LaguerreFit:
@@ -156,7 +156,7 @@ def fit_laguerre(
         moments under a Gaussian window.
     matched : bool
         Vary the basis until `b10 = b20 = b11 = 0`: the object's own centre, shape and size.
-    scale : float
+    scale : float or array, shape (n_gal,)
         Fit with a basis this much larger than the matched, or given, one.
     max_iter : int
         Steps of the matching.
@@ -191,7 +191,8 @@ def fit_laguerre(
     (array([3.]), np.float64(3.0))
     """
     xp, stamps, ivar = _checked(stamps, ivar)
-    _check_numbers(order, stamps, scale=scale, chunk_size=chunk_size)
+    _check_numbers(order, stamps, chunk_size=chunk_size)
+    scale = _checked_scale(stamps, scale)
     start = _checked_start(stamps, eta=eta, centroid=centroid, size=size)
     n_gal = int(stamps.shape[0])
     n_chunk = chunk_size or _galaxies_at_once(order, stamps)
@@ -203,7 +204,7 @@ def fit_laguerre(
         basis = _starting_basis(pixels, weights, order, here)
         root = match_basis(basis, pixels, weights, max_iter) if matched else None
         basis = basis if root is None else basis_at(root.x, basis)
-        basis = replace(basis, size=scale * basis.size)
+        basis = replace(basis, size=scale[rows] * basis.size)
         parts.append(_described(basis, pixels, weights, root, flags))
     return LaguerreFit.concat(parts)
 
@@ -234,7 +235,13 @@ def _described(
     xp = array_namespace(stamps=stamps)
     basis, sane = screened_basis(basis, min(stamps.shape[1:]))
     fit = fit_pixels(basis, stamps, ivar)
-    reasons = [(Flag.GL_FAILURE, ~(fit.inflation < LARGEST_INFLATION) | ~sane)]
+    gaps = fit.n_pixels < int(stamps.shape[1]) * int(stamps.shape[2])
+    largest = xp.where(
+        gaps,
+        xp.full_like(fit.inflation, LARGEST_WITH_GAPS),
+        xp.full_like(fit.inflation, LARGEST_INFLATION),
+    )
+    reasons = [(Flag.GL_FAILURE, ~(fit.inflation < largest) | ~sane)]
     if root is not None:
         reasons += [
             (Flag.NO_SIGNAL, root.status == int(Status.NON_FINITE)),
@@ -337,11 +344,26 @@ def check_fit_order(order: int, stamps: Array) -> None:
         )
 
 
-def _check_numbers(order: int, stamps: Array, *, scale: float, chunk_size: int | None) -> None:
+def _checked_scale(stamps: Array, scale: float | Array) -> Array:
+    """Refuse what is no scale; return one for each galaxy."""
+    xp = array_namespace(stamps=stamps)
+    if isinstance(scale, int | float):
+        if not (math.isfinite(scale) and scale > 0):
+            raise RangeError("scale", scale, 0.0, None)
+        return xp.full_like(stamps[:, 0, 0], float(scale))
+    array_namespace(stamps=stamps, scale=scale)
+    require_dtype(stamps.dtype, scale=scale)
+    if tuple(scale.shape) != (int(stamps.shape[0]),):
+        raise ShapeMismatchError(
+            f"scale must be a number or have the shape ({stamps.shape[0]},), not "
+            f"{tuple(scale.shape)}"
+        )
+    return scale
+
+
+def _check_numbers(order: int, stamps: Array, *, chunk_size: int | None) -> None:
     """Refuse numbers that mean nothing."""
     check_fit_order(order, stamps)
-    if not (math.isfinite(scale) and scale > 0):
-        raise RangeError("scale", scale, 0.0, None)
     if chunk_size is not None:
         check_count("chunk_size", chunk_size, 1)
 

@@ -8,8 +8,12 @@ from typing import Final
 from fdnt_xp.arrays import Array, array_namespace, device_of
 
 LARGEST_INFLATION: Final = 20.0
-"""Inflation of a variance beyond which a fit is degenerate. Masks of a tenth of the pixels or a
-column through the centre give 1.2, three columns 5, a quadrant cut off at the centre 1e6."""
+"""Inflation of a variance beyond which a fit is degenerate; a quadrant cut off at the centre makes
+1e6."""
+LARGEST_WITH_GAPS: Final = 4.0
+"""The same where pixels are missing, and with them what no function says of the galaxy. A tenth of
+the pixels at random or a column through the centre make 1.3, four columns or a hole of 3 pixels
+radius 8 (order 12, galaxy and PSF of 3 pixels)."""
 _RIDGE: Final = 10.0
 """In eps times the number of coefficients: more than rounding can take off an eigenvalue."""
 _REFINEMENTS: Final = 2

@@ -21,6 +21,7 @@ class ShapeMethod(Protocol):
         psf: Psf,
         *,
         noise_variance: float | Array | None = None,
+        ivar: Array | None = None,
         size: float | None = None,
         padding: int = 1,
         chunk_size: int | None = None,
