@@ -68,7 +68,7 @@ def entries(args: argparse.Namespace) -> Iterator[Entry]:
         return tuple(make_simulation("low-noise", seed=seed, **size, **sets) for seed in seeds)
 
     if "cells" in args.part:
-        for cell in (64, 40):
+        for cell in args.cells:
             yield Entry(
                 name=f"cells of {cell}",
                 simulations=low_noise(cell, 100, args.seeds),
@@ -187,6 +187,7 @@ def main() -> None:
     parser.add_argument("directory", type=Path)
     parser.add_argument("--part", choices=PARTS, action="append", help="[default: all]")
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
+    parser.add_argument("--cells", type=int, nargs="+", default=[64, 40], help="of the part cells")
     parser.add_argument("--sets", type=int, help="of each simulation [default: 15, RealNoise 27]")
     parser.add_argument("--grid", type=int, help="cells on a side [default: 100, some parts 50]")
     parser.add_argument("--jobs", type=int, default=1)
