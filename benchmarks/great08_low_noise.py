@@ -77,7 +77,7 @@ def entries(args: argparse.Namespace) -> Iterator[Entry]:
     if "estimators" in args.part:
         yield Entry(
             name="every estimator",
-            simulations=low_noise(64, 100, args.seeds[:1]),
+            simulations=low_noise(64, 50, args.seeds[:1]),
             estimators=tuple(ESTIMATORS),
         )
     if "methods" in args.part:
@@ -90,7 +90,7 @@ def entries(args: argparse.Namespace) -> Iterator[Entry]:
             )
     if "real-noise" in args.part:
         for snr in (20.0, 10.0):
-            size = {"cell": 64, "grid": args.grid or 50, "snr": snr}
+            size = {"cell": 64, "grid": args.grid or 30, "snr": snr}
             drawn = make_simulation("real-noise", seed=args.seeds[0], **size, **sets)
             yield Entry(
                 name=f"RealNoise, S/N {snr:g}",
@@ -189,7 +189,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
     parser.add_argument("--cells", type=int, nargs="+", default=[64, 40], help="of the part cells")
     parser.add_argument("--sets", type=int, help="of each simulation [default: 15, RealNoise 27]")
-    parser.add_argument("--grid", type=int, help="cells on a side [default: 100, some parts 50]")
+    parser.add_argument("--grid", type=int, help="cells on a side [default: 100, 50 or 30 by part]")
     parser.add_argument("--jobs", type=int, default=1)
     args = parser.parse_args()
     args.part = args.part or list(PARTS)
