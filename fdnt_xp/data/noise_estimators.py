@@ -113,7 +113,6 @@ def _null(stamps: NoisyStamps, settings: Settings, **options: Any) -> Found:
             padding=settings.padding,
             **numbers,
             softening=settings.softening,
-            bound=settings.bound,
             **{"bound": settings.bound, **options},
         )
     )
