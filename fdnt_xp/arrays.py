@@ -8,7 +8,7 @@ never learn which library they run on.
 from __future__ import annotations
 
 from types import ModuleType
-from typing import Any, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import array_api_compat
 import numpy as np
@@ -21,6 +21,11 @@ Rows: TypeAlias = "slice | Array"
 """Some of the rows of an array: a range, or an integer array."""
 Device: TypeAlias = Any
 DType: TypeAlias = Any
+
+_NUMBERS_IN_CACHE: Final = 2**16
+"""Of an array that is used again before it is pushed out, together with a few others."""
+
+_NAMESPACES: Final[dict[type, ModuleType]] = {}
 
 
 def array_namespace(**arrays: Array | None) -> ModuleType:
@@ -38,31 +43,36 @@ def array_namespace(**arrays: Array | None) -> ModuleType:
     NamespaceError
         If two arguments belong to different libraries or devices; both are named.
     """
-    first: tuple[str, ModuleType, Device] | None = None
+    first: tuple[str, ModuleType, Array] | None = None
     for name, array in arrays.items():
         if array is None:
             continue
-        if not is_array(array):
-            raise FdntTypeError(
-                f"{name} must be an array (numpy, torch, jax, cupy, ...), "
-                f"not {type(array).__name__}"
-            )
-        xp = array_api_compat.array_namespace(array)
-        where = array_api_compat.device(array)
+        xp = _NAMESPACES.get(type(array)) or _namespace_of(name, array)
         if first is None:
-            first = (name, xp, where)
+            first = (name, xp, array)
         elif xp is not first[1]:
             raise NamespaceError(
                 f"{name} is a {_library(xp)} array but {first[0]} is a {_library(first[1])} "
                 "array; convert one of them, nothing is moved silently"
             )
-        elif where != first[2]:
+        elif (where := device_of(array)) != (expected := device_of(first[2])):
             raise NamespaceError(
-                f"{name} is on device {where} but {first[0]} is on {first[2]}; move one of them"
+                f"{name} is on device {where} but {first[0]} is on {expected}; move one of them"
             )
     if first is None:
         raise FdntTypeError("at least one array is needed to choose the library")
     return first[1]
+
+
+def _namespace_of(name: str, array: Array) -> ModuleType:
+    """Find out about a type of arrays, once: small kernels ask thousands of times a second."""
+    if not is_array(array):
+        raise FdntTypeError(
+            f"{name} must be an array (numpy, torch, jax, cupy, ...), not {type(array).__name__}"
+        )
+    xp: ModuleType = array_api_compat.array_namespace(array)
+    _NAMESPACES[type(array)] = xp
+    return xp
 
 
 def is_array(value: object) -> bool:
@@ -96,6 +106,25 @@ def rows_of(array: Array, rows: Rows) -> Array:
     if isinstance(rows, slice):
         return array[rows, ...]
     return array_namespace(rows=rows).take(array, rows, axis=0)
+
+
+def works_in_blocks(array: Array) -> bool:
+    """Return whether many rows are faster a few at a time: on a CPU, for its cache.
+
+    Not where each length of a batch is compiled anew.
+    """
+    on_cpu = "cpu" in str(device_of(array)).lower()
+    return on_cpu and not compiles_every_shape(array_namespace(array=array))
+
+
+def blocks_in_cache(array: Array) -> list[slice]:
+    """Return ranges of the rows of an (n, m) array to be worked at one at a time.
+
+    There is always one, be it empty.
+    """
+    n, m = (int(length) for length in array.shape)
+    rows = max(1, _NUMBERS_IN_CACHE // max(m, 1)) if works_in_blocks(array) else max(n, 1)
+    return [slice(first, min(first + rows, n)) for first in range(0, max(n, 1), rows)]
 
 
 def as_floating(xp: ModuleType, array: Array, name: str) -> Array:

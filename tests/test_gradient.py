@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from array_api_extra.testing import assert_close
@@ -11,6 +9,7 @@ from scipy.optimize import root
 
 import fdnt_xp as fx
 from fdnt_xp.fourier.transform import deconvolve
+from fdnt_xp.nulltests import tests as null_tests
 from fdnt_xp.nulltests.tests import NullTests
 from fdnt_xp.shapes.job import check_stamps, prepare
 from images import galaxies, star
@@ -50,16 +49,8 @@ def observed(number, radius, degrees=0.0):
 
 def eta_at(shrink, stamps, psf, shapes, monkeypatch):
     """Solve the tests at a given s, by SciPy and its own numerical derivatives."""
-    view_of = NullTests._view
-
-    def view_at(self, eta, centroid):
-        view = view_of(self, eta, centroid)
-        s = np.full_like(view.shrink, shrink)
-        factor, slope = self.weight.psf_factor(view.square, s)
-        return replace(view, shrink=s, psf_factor=factor, psf_slope=slope)
-
     xp, stamps = check_stamps(stamps, psf)
-    job = prepare(xp, stamps, psf, 1, None, 50)
+    job = prepare(xp, stamps, psf, padding=1)
     data = deconvolve(stamps, psf.inverse_transfer(job.coarse), job.coarse)
     tests = NullTests(grid=job.coarse, galaxies=data, weight=job.weight, length=1.0)
 
@@ -69,7 +60,7 @@ def eta_at(shrink, stamps, psf, shapes, monkeypatch):
 
     start = np.concatenate([shapes.eta[0], shapes.centroid[0] - 0.5 * (N - 1)])
     with monkeypatch.context() as patch:
-        patch.setattr(NullTests, "_view", view_at)
+        patch.setattr(null_tests, "shrink_factor", lambda eta: np.full(len(eta), shrink))
         solution = root(scaled, start, method="hybr", tol=1e-13)
     assert np.max(np.abs(solution.fun)) < 1e-12
     return solution.x[:2]

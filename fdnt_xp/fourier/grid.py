@@ -94,37 +94,39 @@ class KGrid:
         xp = array_namespace(kx=self.kx)
         return xp.stack([self.kx**2, self.kx * self.ky, self.ky**2], axis=0)
 
-    def even_moments(self, field: Array) -> tuple[Array, Array, Array]:
-        """Return the moments of degree 0, 2 and 4 of a field that is even in k.
+    def moments(self, field: Array, *degrees: int) -> Array:
+        """Return the moments of given degrees of a field, degree after degree.
 
         Parameters
         ----------
         field : array, shape (n_gal, n_k)
+            Even or odd in k, as all the degrees are.
 
         Returns
         -------
-        tuple of arrays, shapes (n_gal, 1), (n_gal, 3) and (n_gal, 5)
-            `sum_k field kx^(d-j) ky^j`, j = 0 .. d, over the whole plane.
+        array, shape (n_gal, number of moments)
+            `sum_k field kx^(d-j) ky^j`, j = 0 .. d, over the whole plane, for each degree d.
         """
-        xp = array_namespace(field=field)
-        moments = xp.matmul(field, self._even)
+        if degrees not in self._monomials:
+            self._monomials[degrees] = self._monomials_of(degrees)
+        return array_namespace(field=field).matmul(field, self._monomials[degrees])
+
+    def even_moments(self, field: Array) -> tuple[Array, Array, Array]:
+        """Return the moments of degree 0, 2 and 4, shapes (n_gal, 1), (n_gal, 3), (n_gal, 5)."""
+        moments = self.moments(field, 0, 2, 4)
         return moments[:, :1], moments[:, 1:4], moments[:, 4:]
 
     def odd_moments(self, field: Array) -> tuple[Array, Array]:
         """Return the moments of degree 1 and 3 of an odd field, shapes (n_gal, 2), (n_gal, 4)."""
-        xp = array_namespace(field=field)
-        moments = xp.matmul(field, self._odd)
+        moments = self.moments(field, 1, 3)
         return moments[:, :2], moments[:, 2:]
 
     @cached_property
-    def _even(self) -> Array:
-        return self._monomials(0, 2, 4)
+    def _monomials(self) -> dict[tuple[int, ...], Array]:
+        """Return the matrices made so far, by their degrees."""
+        return {}
 
-    @cached_property
-    def _odd(self) -> Array:
-        return self._monomials(1, 3)
-
-    def _monomials(self, *degrees: int) -> Array:
+    def _monomials_of(self, degrees: tuple[int, ...]) -> Array:
         """Return `fold kx^(d-j) ky^j`, j = 0 .. d, for each degree, side by side."""
         xp = array_namespace(kx=self.kx)
         columns = [

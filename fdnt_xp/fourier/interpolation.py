@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fdnt_xp.arrays import Array, array_namespace, device_of
+from fdnt_xp.arrays import Array, Rows, array_namespace, device_of, rows_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,11 +23,11 @@ class CubicTable:
     coefficients: tuple[Array, Array, Array, Array]
     n_cell: int
 
-    def take(self, rows: Array) -> CubicTable:
-        """Return the tables with the given row numbers (integer array), in that order."""
-        xp = array_namespace(rows=rows)
+    def take(self, rows: Rows) -> CubicTable:
+        """Return the tables with the given row numbers, in that order."""
+        xp = array_namespace(coefficients=self.coefficients[0])
         tables = (xp.reshape(c, (-1, self.n_cell + 1)) for c in self.coefficients)
-        c0, c1, c2, c3 = (xp.reshape(xp.take(c, rows, axis=0), (-1,)) for c in tables)
+        c0, c1, c2, c3 = (xp.reshape(rows_of(c, rows), (-1,)) for c in tables)
         return CubicTable(coefficients=(c0, c1, c2, c3), n_cell=self.n_cell)
 
     def evaluate(self, t: Array, row: Array | None = None) -> tuple[Array, Array]:
@@ -41,7 +41,8 @@ class CubicTable:
             The table of each row of `t`; the only table if absent.
         """
         xp = array_namespace(t=t)
-        position = xp.minimum(t * self.n_cell, xp.full_like(t, float(self.n_cell)))
+        end = xp.full((1,) * t.ndim, float(self.n_cell), dtype=t.dtype, device=device_of(t))
+        position = xp.minimum(t * self.n_cell, end)
         cell = xp.astype(position, xp.int64)
         z = position - xp.astype(cell, t.dtype)
         if row is not None:
@@ -49,9 +50,11 @@ class CubicTable:
             cell = cell + (first if t.ndim == 1 else first[:, None])
         flat = xp.reshape(cell, (-1,))
         c0, c1, c2, c3 = (xp.reshape(xp.take(c, flat, axis=0), t.shape) for c in self.coefficients)
-        value = c0 + z * (c1 + z * (c2 + z * c3))
-        slope = (c1 + z * (2.0 * c2 + 3.0 * z * c3)) * self.n_cell
-        return value, slope
+        # Horner's scheme for both at once.
+        z_c3 = z * c3
+        quadratic = c2 + z_c3
+        linear = c1 + z * quadratic
+        return c0 + z * linear, (linear + z * (quadratic + z_c3)) * self.n_cell
 
 
 def cubic_table(values: Array, *, zero_beyond: bool = False) -> CubicTable:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fdnt_xp.arrays import Array, array_namespace, device_of
+from fdnt_xp.arrays import Array, Rows, array_namespace, blocks_in_cache, device_of, rows_of
 from fdnt_xp.fourier.grid import KGrid
 
 
@@ -24,12 +24,9 @@ class DeconvolvedStamps:
     re: Array
     im: Array
 
-    def take(self, rows: Array) -> DeconvolvedStamps:
+    def take(self, rows: Rows) -> DeconvolvedStamps:
         """Return the galaxies with the given row numbers."""
-        xp = array_namespace(re=self.re)
-        return DeconvolvedStamps(
-            re=xp.take(self.re, rows, axis=0), im=xp.take(self.im, rows, axis=0)
-        )
+        return DeconvolvedStamps(re=rows_of(self.re, rows), im=rows_of(self.im, rows))
 
     def shifted(self, grid: KGrid, centroid: Array) -> tuple[Array, Array]:
         """Return `Re` and `Im` of `exp(+i k.x0) I~(k)`: the galaxies moved to the origin.
@@ -58,16 +55,21 @@ def deconvolve(stamps: Array, inverse_transfer: Array, grid: KGrid) -> Deconvolv
         Its `shape` is that of the stamps, or larger: then they are padded with zeros.
     """
     xp = array_namespace(stamps=stamps)
-    n_gal, ny, nx = stamps.shape
-    spectrum = xp.fft.rfftn(stamps, s=grid.shape, axes=(-2, -1))
-    spectrum = xp.reshape(spectrum, (n_gal, grid.n_half_plane))
-    spectrum = xp.take(spectrum, grid.index, axis=1)
+    n_gal, ny, nx = (int(length) for length in stamps.shape)
     # Pixel (0, 0) is at -middle from the centre of the stamp, which is where x = 0.
     middle = xp.asarray(
         [[-0.5 * (nx - 1), -0.5 * (ny - 1)]], dtype=stamps.dtype, device=device_of(stamps)
     )
-    spectrum = spectrum * (inverse_transfer / mode_phase(grid, middle))
-    return DeconvolvedStamps(re=xp.real(spectrum), im=xp.imag(spectrum))
+    factor = inverse_transfer / mode_phase(grid, middle)
+    re, im = [], []
+    for rows in blocks_in_cache(xp.reshape(stamps, (n_gal, ny * nx))):
+        spectrum = xp.fft.rfftn(stamps[rows, ...], s=grid.shape, axes=(-2, -1))
+        spectrum = xp.reshape(spectrum, (rows.stop - rows.start, grid.n_half_plane))
+        spectrum = xp.take(spectrum, grid.index, axis=1)
+        spectrum = spectrum * (factor if int(factor.shape[0]) == 1 else factor[rows, :])
+        re.append(xp.real(spectrum))
+        im.append(xp.imag(spectrum))
+    return DeconvolvedStamps(re=xp.concat(re), im=xp.concat(im))
 
 
 def half_plane_axes(grid: KGrid) -> tuple[Array, Array]:

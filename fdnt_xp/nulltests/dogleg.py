@@ -17,6 +17,7 @@ from typing import Final, Protocol, Self
 
 from fdnt_xp.arrays import (
     Array,
+    DType,
     array_namespace,
     as_floating,
     compiles_every_shape,
@@ -223,7 +224,7 @@ def find_root(problem: RootProblem, x0: Array, *, options: DoglegOptions = _DEFA
     """
     x0 = as_floating(xp := array_namespace(x0=x0), x0, "x0")
     eps, ftol, least = float(xp.finfo(x0.dtype).eps), options.ftol, options.min_radius
-    ftol = (1e-11 if eps < 1e-12 else 1e-5) if ftol is None else ftol
+    ftol = default_ftol(xp, x0.dtype) if ftol is None else ftol
     least = 10.0 * eps * options.initial_radius if least is None else least
     compact_below = options.compact_below
     if compact_below is None:
@@ -243,6 +244,11 @@ def find_root(problem: RootProblem, x0: Array, *, options: DoglegOptions = _DEFA
                 state, problem = state.take(order[:n_running]), problem.take(order[:n_running])
         state = _step(xp, problem, state, (ftol, least, options.max_radius))
     return _collect(xp, [*finished, state])
+
+
+def default_ftol(xp: ModuleType, dtype: DType) -> float:
+    """Return the `ftol` of a floating dtype, where none is asked for."""
+    return 1e-11 if float(xp.finfo(dtype).eps) < 1e-12 else 1e-5
 
 
 def _start(xp: ModuleType, problem: RootProblem, x: Array, radius: float, ftol: float) -> _State:
@@ -348,27 +354,32 @@ def newton_step(xp: ModuleType, f: Array, jac: Array) -> tuple[Array, Array]:
     screen by would be a second factorisation.
     """
     tiny = _SINGULAR * float(xp.finfo(f.dtype).eps)
-    place = xp.arange(f.shape[1], dtype=xp.int64, device=device_of(f))[None, :]
+    n, d = f.shape
+    place = xp.arange(d, dtype=xp.int64, device=device_of(f))[:, None]
     scale = _scale(xp, _size(xp, jac), _size(xp, f)[:, None])
     work = xp.concat([jac, -f[..., None]], axis=-1) / scale[..., None]
-    unused, columns = xp.ones_like(f, dtype=xp.bool), []
-    regular = xp.all(unused, axis=-1)
-    for k in range(f.shape[1]):
-        column = work[..., k]
+    # The batch last, in memory too: a library then runs along it, and not along four numbers.
+    numbers = xp.unstack(xp.reshape(work, (n, d * (d + 1))), axis=1)
+    work = xp.reshape(xp.stack(numbers, axis=0), (d, d + 1, n))
+    unused, columns = xp.ones_like(work[:, 0, :], dtype=xp.bool), []
+    regular = xp.all(unused, axis=0)
+    for k in range(d):
+        column = work[:, k, :]
         candidates = xp.where(unused, xp.abs(column), -xp.ones_like(column))
-        here = place == xp.argmax(candidates, axis=-1, keepdims=True)
+        here = place == xp.argmax(candidates, axis=0, keepdims=True)
         # A sum of which one term is not 0 is a selection, and exact.
-        row = xp.sum(xp.where(here[..., None], work, xp.zeros_like(work)), axis=1)
-        fair = xp.max(candidates, axis=-1) > tiny
-        row = row / xp.where(fair, row[:, k], xp.ones_like(row[:, k]))[:, None]
-        rest = work - column[..., None] * row[:, None, :]
-        work = xp.where(here[..., None], row[:, None, :], rest)
+        row = xp.sum(xp.where(here[:, None, :], work, xp.zeros_like(work)), axis=0)
+        fair = xp.max(candidates, axis=0) > tiny
+        row = row / xp.where(fair, row[k, :], xp.ones_like(row[k, :]))
+        rest = work - column[:, None, :] * row
+        work = xp.where(here[:, None, :], row, rest)
         unused, regular = unused & ~here, regular & fair
         columns.append(here)
-    answer, zero = work[..., -1], xp.zeros_like(f)
-    step = xp.stack([xp.sum(xp.where(h, answer, zero), axis=-1) for h in columns], axis=-1)
+    answer = work[:, -1, :]
+    zero = xp.zeros_like(answer)
+    step = xp.stack([xp.sum(xp.where(h, answer, zero), axis=0) for h in columns], axis=-1)
     regular = regular & xp.all(xp.isfinite(step), axis=-1)
-    return xp.where(regular[:, None], step, zero), regular
+    return xp.where(regular[:, None], step, xp.zeros_like(step)), regular
 
 
 def _collect(xp: ModuleType, parts: list[_State]) -> RootResult:

@@ -18,9 +18,10 @@ of `W I~` and `(d𝒯/dq) I~` (docs, "Sheared moments are moments").
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import TypeVar
 
-from fdnt_xp.arrays import Array, array_namespace
+from fdnt_xp.arrays import Array, Rows, array_namespace, blocks_in_cache, rows_of
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.transform import DeconvolvedStamps
 from fdnt_xp.nulltests.forms import ShearedForms, contract, sheared_forms
@@ -107,16 +108,61 @@ class TestNoise:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _View:
-    """The galaxies as a trial shape and centroid sees them; fields are (n_gal, n_k)."""
+class _Frame:
+    """Where a trial shape is round: what depends on eta alone."""
 
     forms: ShearedForms
     shrink: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class _View:
+    """The galaxies as a trial shape and centroid sees them; fields are (n_gal, n_k)."""
+
     square: Array
     re: Array
     im: Array
     psf_factor: Array
     psf_slope: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Width:
+    """The size equation solved: sigma², its slope by `1/<|k'|²>`, and if it is at a bound."""
+
+    width: Array
+    slope: Array
+    at_bound: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Moments:
+    """All that the tests and their slopes need of the fields; (n_gal, number of moments).
+
+    `𝒯' = d𝒯/dq`, G is the Gaussian part of the weight, and W = 𝒯 G; the moments are those of
+    the degrees named.
+    """
+
+    t_re: Array  # 𝒯 Re: 0, 2
+    t_im: Array  # 𝒯 Im: 1, 3
+    dt_re: Array  # 𝒯' Re: 2, 4
+    w_re: Array  # W Re: 0, 2, 4
+    w_im: Array  # W Im: 1, 3
+    dw_re: Array  # 𝒯' G Re: 4
+    dw_im: Array  # 𝒯' G Im: 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class _PowerMoments:
+    """Moments of what noise needs: products of weights, all but the last times `1/|T|²`."""
+
+    ww: Array  # W²: 0, 2, 4
+    wt: Array  # W 𝒯: 0, 2, 4
+    tt: Array  # 𝒯²: 0, 2, 4
+    wg: Array  # W G: 0
+
+
+_Parts = TypeVar("_Parts", _Moments, _Width, _PowerMoments)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,15 +186,14 @@ class NullTests:
     length: float
     fixed_width: Array | None = None
 
-    def take(self, rows: Array) -> NullTests:
-        """Return the tests of the given galaxies (integer array)."""
-        xp = array_namespace(rows=rows)
+    def take(self, rows: Rows) -> NullTests:
+        """Return the tests of the given galaxies."""
         fixed = self.fixed_width
         return replace(
             self,
             galaxies=self.galaxies.take(rows),
             weight=self.weight.take(rows),
-            fixed_width=None if fixed is None else xp.take(fixed, rows, axis=0),
+            fixed_width=None if fixed is None else rows_of(fixed, rows),
         )
 
     def evaluate(self, x: Array) -> tuple[Array, Array]:
@@ -158,9 +203,12 @@ class NullTests:
         solution: Newton's method in five unknowns with the fifth equation satisfied. NaN
         where t0 is not positive: there is no galaxy to null.
         """
-        xp = array_namespace(x=x)
         eta = x[:, :2]
-        tests, matched = self.at(eta, self.length * x[:, 2:])
+        return self.scaled(eta, *self.at(eta, self.length * x[:, 2:]))
+
+    def scaled(self, eta: Array, tests: TestValues, matched: MatchedWidth) -> tuple[Array, Array]:
+        """Return what `evaluate` does, from the raw tests and the width at `eta`."""
+        xp = array_namespace(eta=eta)
         # ln s = |eta|/2. At eta = 0 its slope has no direction; the mean of all is 0.
         norm = xp.sqrt(eta[:, 0] ** 2 + eta[:, 1] ** 2)
         safe = xp.where(norm > 0, norm, xp.ones_like(norm))
@@ -172,7 +220,14 @@ class NullTests:
             + tests.by_ln_shrink[:, :, None] * ln_shrink_slope[:, None, :]
             + tests.by_width[:, :, None] * width_slope[:, None, :]
         )
-        return self._scaled(tests.values, slopes)
+        scale = tests.values[:, 4:]
+        inverse = inverse_if_positive(scale)
+        raw = tests.values[:, :4] * inverse
+        jac = (slopes[:, :4, :] - raw[:, :, None] * slopes[:, 4:, :]) * inverse[:, :, None]
+        inv = 1.0 / self.length
+        f = xp.concat([raw[:, :2], inv * raw[:, 2:]], axis=-1)
+        jac = xp.concat([jac[:, :2, :], inv * jac[:, 2:, :]], axis=1)
+        return f, xp.concat([jac[:, :, :2], self.length * jac[:, :, 2:]], axis=2)
 
     def at(self, eta: Array, centroid: Array) -> tuple[TestValues, MatchedWidth]:
         """Return the raw tests and the width of the weight.
@@ -183,9 +238,10 @@ class NullTests:
         centroid : array, shape (n_gal, 2)
             Pixels from the centre of the stamp.
         """
-        view = self._view(eta, centroid)
-        matched = self._matched_width(view)
-        return self._tests(view, matched.width), matched
+        frame = _Frame(forms=sheared_forms(eta), shrink=shrink_factor(eta))
+        moments, width, _ = self._moments(frame, centroid)
+        matched = self._matched_width(frame, moments, width)
+        return self._tests(frame, moments, width.width), matched
 
     def noise(self, eta: Array, centroid: Array, inverse_power: Array) -> TestNoise:
         """Return the noise of the raw tests, and the flux, at a solution.
@@ -200,41 +256,34 @@ class NullTests:
         inverse_power : array, shape (n_gal or 1, n_k)
             `1/|T|²`: noise power of the deconvolved image for unit noise power per mode.
         """
-        view = self._view(eta, centroid)
-        matched = self._matched_width(view)
-        gauss = _gauss(view.square, matched.width)
-        weight = view.psf_factor * gauss
-        tests = self._tests(view, matched.width)
-        ww0, ww2, ww4 = self.grid.even_moments(weight * weight * inverse_power)
-        even = self._with_width_noise(view, matched, tests.by_width, weight, inverse_power, ww4)
-        sum_gauss = self.grid.even_moments(weight * gauss)[0][:, 0]
+        frame = _Frame(forms=sheared_forms(eta), shrink=shrink_factor(eta))
+        moments, width, power = self._moments(frame, centroid, inverse_power)
+        assert power is not None  # as inverse_power was given
+        matched = self._matched_width(frame, moments, width)
+        tests = self._tests(frame, moments, width.width)
+        even = self._with_width_noise(frame, matched, tests.by_width, power)
+        sum_gauss = power.wg[:, 0]
         return TestNoise(
             even=_symmetric(even),
-            odd=_symmetric(ww2),
-            flux=self.grid.even_moments(weight * view.re)[0][:, 0] / sum_gauss,
-            flux_variance=ww0[:, 0] / sum_gauss**2,
+            odd=_symmetric(power.ww[:, 1:4]),
+            flux=moments.w_re[:, 0] / sum_gauss,
+            flux_variance=power.ww[:, 0] / sum_gauss**2,
             tests=tests,
             matched=matched,
         )
 
     def _with_width_noise(
-        self,
-        view: _View,
-        matched: MatchedWidth,
-        by_width: Array,
-        weight: Array,
-        inverse_power: Array,
-        ww4: Array,
+        self, frame: _Frame, matched: MatchedWidth, by_width: Array, power: _PowerMoments
     ) -> Array:
         """Return Var t1, Cov(t1, t2), Var t2, with the noise that comes by the width.
 
         Noise moves the width by `by_ln_square` times `d ln<|k'|²>`, which is
         `sum 𝒯 dRe I~ (q/Q - 1/F)` with F and Q the `flux` and `square` of the match.
         """
-        xp = array_namespace(weight=weight)
-        f0, *quadrupoles = view.forms.forms
-        _, wa2, wa4 = self.grid.even_moments(weight * view.psf_factor * inverse_power)
-        aa0, aa2, aa4 = self.grid.even_moments(view.psf_factor**2 * inverse_power)
+        xp = array_namespace(by_width=by_width)
+        f0, *quadrupoles = frame.forms.forms
+        ww4, wa2, wa4 = power.ww[:, 4:], power.wt[:, 1:4], power.wt[:, 4:]
+        aa0, aa2, aa4 = power.tt[:, :1], power.tt[:, 1:4], power.tt[:, 4:]
         inv_square, inv_flux = _inverse(matched.square)[:, None], _inverse(matched.flux)[:, None]
         ln_square_var = (
             contract(contract(aa4, f0), f0) * inv_square**2
@@ -255,31 +304,78 @@ class NullTests:
         ]
         return xp.concat(covariances, axis=-1)
 
-    def _view(self, eta: Array, centroid: Array) -> _View:
-        xp = array_namespace(eta=eta)
-        forms = sheared_forms(eta)
-        shrink = xp.exp(0.5 * xp.sqrt(eta[:, 0] ** 2 + eta[:, 1] ** 2))
-        # Rounding can make a tiny q negative; it is a square.
-        square = xp.matmul(forms.forms[0], self.grid.squares)
-        square = xp.maximum(square, xp.zeros_like(square))
+    def _moments(
+        self, frame: _Frame, centroid: Array, inverse_power: Array | None = None
+    ) -> tuple[_Moments, _Width, _PowerMoments | None]:
+        """Sum over k, a few galaxies at a time: the fields then never leave the cache."""
+        moments, widths, powers = [], [], []
+        for rows in blocks_in_cache(self.galaxies.re):
+            block = self.take(rows)
+            f0, shrink = frame.forms.forms[0][rows, :], frame.shrink[rows]
+            view = block._view(f0, shrink, centroid[rows, :])
+            t_re = self.grid.moments(view.psf_factor * view.re, 0, 2)
+            width = block._width(t_re, f0, shrink)
+            gauss = _gauss(view.square, width.width)
+            weight = view.psf_factor * gauss
+            moments.append(self._field_moments(view, t_re, gauss, weight))
+            widths.append(width)
+            if inverse_power is not None:
+                shared = int(inverse_power.shape[0]) == 1
+                inverse = inverse_power if shared else inverse_power[rows, :]
+                powers.append(self._power_moments(view.psf_factor, gauss, weight, inverse))
+        return _joined(moments), _joined(widths), _joined(powers) if powers else None
+
+    def _view(self, f0: Array, shrink: Array, centroid: Array) -> _View:
+        square = array_namespace(f0=f0).matmul(f0, self.grid.squares)
         re, im = self.galaxies.shifted(self.grid, centroid)
         factor, slope = self.weight.psf_factor(square, shrink)
-        return _View(
-            forms=forms,
-            shrink=shrink,
-            square=square,
-            re=re,
-            im=im,
-            psf_factor=factor,
-            psf_slope=slope,
+        return _View(square=square, re=re, im=im, psf_factor=factor, psf_slope=slope)
+
+    def _field_moments(self, view: _View, t_re: Array, gauss: Array, weight: Array) -> _Moments:
+        moments, slope = self.grid.moments, view.psf_slope * gauss
+        return _Moments(
+            t_re=t_re,
+            t_im=moments(view.psf_factor * view.im, 1, 3),
+            dt_re=moments(view.psf_slope * view.re, 2, 4),
+            w_re=moments(weight * view.re, 0, 2, 4),
+            w_im=moments(weight * view.im, 1, 3),
+            dw_re=moments(slope * view.re, 4),
+            dw_im=moments(slope * view.im, 3),
         )
 
-    def _matched_width(self, view: _View) -> MatchedWidth:
-        """Solve the size equation in a view."""
-        xp = array_namespace(square=view.square)
-        a0, a2, _ = self.grid.even_moments(view.psf_factor * view.re)
-        f0 = view.forms.forms[0]
-        flux, square = a0[:, 0], contract(a2, f0)[:, 0]
+    def _power_moments(
+        self, psf_factor: Array, gauss: Array, weight: Array, inverse_power: Array
+    ) -> _PowerMoments:
+        moments = self.grid.moments
+        colour = weight * inverse_power
+        return _PowerMoments(
+            ww=moments(weight * colour, 0, 2, 4),
+            wt=moments(psf_factor * colour, 0, 2, 4),
+            tt=moments(psf_factor**2 * inverse_power, 0, 2, 4),
+            wg=moments(weight * gauss, 0),
+        )
+
+    def _width(self, t_re: Array, f0: Array, shrink: Array) -> _Width:
+        """Solve the size equation from the moments of 𝒯 Re I~."""
+        xp = array_namespace(t_re=t_re)
+        flux, square = t_re[:, 0], contract(t_re[:, 1:], f0)[:, 0]
+        if self.fixed_width is not None:
+            zero = xp.zeros_like(flux)
+            return _Width(width=self.fixed_width, slope=zero, at_bound=zero > 0)
+        # A mean square that noise made negative or tiny asks for the widest weight.
+        positive = (square > 0) & (flux > 0)
+        safe = xp.where(positive, square, xp.ones_like(square))
+        inverse = xp.where(positive, flux / safe, xp.full_like(flux, 1e30))
+        width, slope, at_bound = self.weight.matched_width(inverse, shrink)
+        # Of a size that knows nothing of the galaxy there is no slope either.
+        slope = xp.where(positive, slope, xp.zeros_like(slope))
+        return _Width(width=width, slope=slope, at_bound=at_bound)
+
+    def _matched_width(self, frame: _Frame, moments: _Moments, width: _Width) -> MatchedWidth:
+        """Return the width with its derivatives."""
+        xp = array_namespace(t_re=moments.t_re)
+        flux, a2 = moments.t_re[:, 0], moments.t_re[:, 1:]
+        square = contract(a2, frame.forms.forms[0])[:, 0]
         if self.fixed_width is not None:
             zero = xp.zeros_like(flux)
             return MatchedWidth(
@@ -291,36 +387,31 @@ class NullTests:
                 square=square,
                 at_bound=zero > 0,
             )
-        # A mean square that noise made negative or tiny asks for the widest weight.
-        positive = (square > 0) & (flux > 0)
-        safe = xp.where(positive, square, xp.ones_like(square))
-        inverse = xp.where(positive, flux / safe, xp.full_like(flux, 1e30))
-        width, slope, at_bound = self.weight.matched_width(inverse, view.shrink)
-        by_ln_square = -slope * xp.where(positive, inverse, xp.zeros_like(inverse))
-        by_parameter, by_ln_shrink = self._ln_mean_square_slopes(view, a2, flux, square)
+        by_ln_square = -width.slope * (flux * _inverse(square))
+        by_parameter, by_ln_shrink = self._ln_mean_square_slopes(frame, moments, flux, square)
         # At fixed <k'²> the width goes with s²: it is s² times a function of s² <k'²>.
-        explicit = 2.0 * (width + by_ln_square)
+        explicit = 2.0 * (width.width + by_ln_square)
         return MatchedWidth(
-            width=width,
+            width=width.width,
             by_parameter=by_ln_square[:, None] * by_parameter,
             by_ln_shrink=explicit + by_ln_square * by_ln_shrink,
             by_ln_square=by_ln_square,
             flux=flux,
             square=square,
-            at_bound=at_bound,
+            at_bound=width.at_bound,
         )
 
     def _ln_mean_square_slopes(
-        self, view: _View, a2: Array, flux: Array, square: Array
+        self, frame: _Frame, moments: _Moments, flux: Array, square: Array
     ) -> tuple[Array, Array]:
         """Return the derivatives of `ln<|k'|²>` by (eta1, eta2, x0, y0) and by ln s."""
         xp = array_namespace(flux=flux)
-        f0 = view.forms.forms[0]
-        _, b2, b4 = self.grid.even_moments(view.psf_slope * view.re)
-        c1, c3 = self.grid.odd_moments(view.psf_factor * view.im)
+        f0 = frame.forms.forms[0]
+        a2, b2, b4 = moments.t_re[:, 1:], moments.dt_re[:, :3], moments.dt_re[:, 3:]
+        c1, c3 = moments.t_im[:, :2], moments.t_im[:, 2:]
         inv_flux, inv_square = _inverse(flux)[:, None], _inverse(square)[:, None]
         by_eta = []
-        for slopes in view.forms.slopes:
+        for slopes in frame.forms.slopes:
             square_slope = contract(contract(b4, f0), slopes[0]) + contract(a2, slopes[0])
             by_eta.append(square_slope * inv_square - contract(b2, slopes[0]) * inv_flux)
         # d Re/dx0 = -kx Im.
@@ -331,22 +422,18 @@ class NullTests:
         )
         return xp.concat([*by_eta, by_centroid], axis=-1), by_ln_shrink[:, 0]
 
-    def _tests(self, view: _View, width: Array) -> TestValues:
-        """Evaluate the tests and their partial derivatives in a view."""
+    def _tests(self, frame: _Frame, moments: _Moments, width: Array) -> TestValues:
+        """Return the tests and their partial derivatives."""
         xp = array_namespace(width=width)
-        gauss = _gauss(view.square, width)
-        weight, slope = view.psf_factor * gauss, view.psf_slope * gauss
-        _, w2, w4 = self.grid.even_moments(weight * view.re)
-        _, _, b4 = self.grid.even_moments(slope * view.re)
-        v1, v3 = self.grid.odd_moments(weight * view.im)
-        _, c3 = self.grid.odd_moments(slope * view.im)
+        w2, w4, b4 = moments.w_re[:, 1:4], moments.w_re[:, 4:], moments.dw_re
+        v1, v3, c3 = moments.w_im[:, :2], moments.w_im[:, 2:], moments.dw_im
         # dW/dq = (d𝒯/dq - 𝒯 sigma²/2) exp(-q sigma²/2).
         half = 0.5 * width[:, None]
         by_square4, by_square3 = b4 - half * w4, c3 - half * v3
-        f0, f1, f2 = view.forms.forms
+        f0, f1, f2 = frame.forms.forms
 
         by_eta = []
-        for d0, d1, d2 in view.forms.slopes:
+        for d0, d1, d2 in frame.forms.slopes:
             moved = contract(by_square4, d0)
             by_eta.append(
                 xp.concat(
@@ -379,17 +466,11 @@ class NullTests:
             by_width=-0.5 * all_five(weighted_square, contract(v3, f0)),
         )
 
-    def _scaled(self, values: Array, slopes: Array) -> tuple[Array, Array]:
-        """Divide the tests by t0, and count centroids in units of L."""
-        xp = array_namespace(values=values)
-        scale = values[:, 4:]
-        inverse = inverse_if_positive(scale)
-        raw = values[:, :4] * inverse
-        jac = (slopes[:, :4, :] - raw[:, :, None] * slopes[:, 4:, :]) * inverse[:, :, None]
-        inv = 1.0 / self.length
-        f = xp.concat([raw[:, :2], inv * raw[:, 2:]], axis=-1)
-        jac = xp.concat([jac[:, :2, :], inv * jac[:, 2:, :]], axis=1)
-        return f, xp.concat([jac[:, :, :2], self.length * jac[:, :, 2:]], axis=2)
+
+def shrink_factor(eta: Array) -> Array:
+    """Return `s = exp(|eta|/2)`, shape (n_gal,)."""
+    xp = array_namespace(eta=eta)
+    return xp.exp(0.5 * xp.sqrt(eta[:, 0] ** 2 + eta[:, 1] ** 2))
 
 
 def inverse_if_positive(scale: Array) -> Array:
@@ -397,6 +478,16 @@ def inverse_if_positive(scale: Array) -> Array:
     xp = array_namespace(scale=scale)
     safe = xp.where(scale > 0, scale, xp.ones_like(scale))
     return xp.where(scale > 0, 1.0 / safe, xp.full_like(scale, float("nan")))
+
+
+def _joined(parts: list[_Parts]) -> _Parts:
+    """Return the rows of all parts, field by field."""
+    first = parts[0]
+    if len(parts) == 1:
+        return first
+    xp = array_namespace(first=getattr(first, fields(first)[0].name))
+    names = [field.name for field in fields(first)]
+    return type(first)(**{name: xp.concat([getattr(p, name) for p in parts]) for name in names})
 
 
 def _gauss(square: Array, width: Array) -> Array:

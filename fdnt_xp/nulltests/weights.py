@@ -20,7 +20,7 @@ from typing import Final
 
 import numpy as np
 
-from fdnt_xp.arrays import Array, array_namespace, device_of
+from fdnt_xp.arrays import Array, Rows, array_namespace, device_of, rows_of
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.interpolation import CubicTable, cubic_table
 from fdnt_xp.fourier.psf import Psf
@@ -30,6 +30,8 @@ _QUADRATURE: Final = 96
 _WIDTH_NODES: Final = 129
 _NEWTON_STEPS: Final = 8
 """1/<k²> is nearly linear in sigma² (exactly so for a Gaussian 𝒯): Newton needs few steps."""
+_LEAST_SQUARE: Final = 1e-30
+"""Of k, (rad/pixel)²: far below that of any mode but k = 0, and no trouble to divide by."""
 _NARROWEST: Final = 0.5
 """Least `sigma kmax`: the Gaussian is then above 0.88 all over the disc and does no more."""
 
@@ -54,13 +56,12 @@ class WidthTable:
     width_range: Array
     square_range: Array
 
-    def take(self, rows: Array) -> WidthTable:
-        """Return the tables with the given row numbers (integer array)."""
-        xp = array_namespace(rows=rows)
+    def take(self, rows: Rows) -> WidthTable:
+        """Return the tables with the given row numbers."""
         return WidthTable(
             part=self.part.take(rows),
-            width_range=xp.take(self.width_range, rows, axis=0),
-            square_range=xp.take(self.square_range, rows, axis=0),
+            width_range=rows_of(self.width_range, rows),
+            square_range=rows_of(self.square_range, rows),
         )
 
 
@@ -82,14 +83,13 @@ class Weight:
     kmax: Array
     widths: WidthTable | None = None
 
-    def take(self, rows: Array) -> Weight:
-        """Return the weights with the given row numbers (integer array); a shared one stays."""
-        xp = array_namespace(kmax=self.kmax)
+    def take(self, rows: Rows) -> Weight:
+        """Return the weights with the given row numbers; a shared one stays."""
         if self.shared:
             return self
         return Weight(
             psf_part=self.psf_part.take(rows),
-            kmax=xp.take(self.kmax, rows, axis=0),
+            kmax=rows_of(self.kmax, rows),
             widths=None if self.widths is None else self.widths.take(rows),
         )
 
@@ -111,20 +111,16 @@ class Weight:
         Parameters
         ----------
         square : array, shape (n_gal, n_k)
-            `q = |k'|²`.
+            `q = |k'|²`; 0 where rounding makes it negative.
         shrink : array, shape (n_gal,)
             s.
         """
         xp = array_namespace(square=square)
-        scale = shrink / self.kmax
-        t = xp.sqrt(square) * scale[:, None]
-        row = self._rows(int(square.shape[0]))
-        value, slope = self.psf_part.evaluate(t, row)
-        # dt/dq = scale²/2t. At k = 0 the derivative only ever meets factors of q.
-        at_zero = t == 0
-        safe = xp.where(at_zero, xp.ones_like(t), t)
-        by_square = xp.where(at_zero, xp.zeros_like(t), slope / safe)
-        return value, by_square * (0.5 * scale**2)[:, None]
+        scale = (shrink / self.kmax)[:, None]
+        # At k = 0 the derivative only ever meets factors of q: any finite number will do.
+        t = xp.sqrt(xp.maximum(square, xp.full_like(scale, _LEAST_SQUARE))) * scale
+        value, slope = self.psf_part.evaluate(t, self._rows(int(square.shape[0])))
+        return value, slope / t * (0.5 * scale**2)
 
     def round_window(self, grid: KGrid, size: float, shrink: Array | None = None) -> Array:
         """Return the weight of a round galaxy on the modes of a grid, shape (n_psf, n_k).

@@ -17,6 +17,7 @@ from fdnt_xp.arrays import (
     device_of,
     require_dtype,
     to_numpy,
+    works_in_blocks,
 )
 from fdnt_xp.errors import FdntTypeError, FdntValueError, RangeError, ShapeMismatchError
 from fdnt_xp.flags import Flag
@@ -34,6 +35,8 @@ _BYTES_AT_ONCE: Final = 128e6
 """Memory of a chunk of galaxies."""
 _FIELDS: Final = 24
 """Arrays of the size of the deconvolved stamps that an evaluation of the tests holds."""
+_FIELDS_IN_BLOCKS: Final = 6
+"""The same where it goes through few galaxies at a time: the transforms, and copies of them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -248,8 +251,14 @@ def screen(stamps: Array, psf: Psf, present: Array | None = None) -> tuple[Array
     return xp.reshape(pixels, stamps.shape), flags
 
 
-def galaxies_at_once(grid: KGrid, stamps: Array, more: int = 0) -> int:
-    """Return how many galaxies fit the memory of a chunk, with `more` numbers for each."""
-    ny, nx = stamps.shape[1:]
-    numbers = _FIELDS * grid.n_k + 3 * int(ny) * int(nx) + more
+def galaxies_at_once(grid: KGrid, stamps: Array, more: int = 0, *, only_tests: bool = False) -> int:
+    """Return how many galaxies fit the memory of a chunk, with `more` numbers for each.
+
+    With `only_tests` nothing but the tests is evaluated, which a CPU does block by block.
+    """
+    ny, nx = (int(length) for length in stamps.shape[1:])
+    if only_tests and works_in_blocks(stamps):
+        numbers = _FIELDS_IN_BLOCKS * grid.n_k + ny * nx + more
+    else:
+        numbers = _FIELDS * grid.n_k + 3 * ny * nx + more
     return max(16, int(_BYTES_AT_ONCE / (numbers * 8)))

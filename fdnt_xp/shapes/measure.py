@@ -9,6 +9,7 @@ pixels -> transform, divided by T        shapes.sources: of the stamps, or of fi
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Final, Literal, TypeAlias
 
@@ -17,7 +18,14 @@ from fdnt_xp.errors import FdntValueError
 from fdnt_xp.flags import Flag
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.psf import Psf
-from fdnt_xp.nulltests.dogleg import DoglegOptions, RootResult, find_root
+from fdnt_xp.nulltests.dogleg import (
+    DoglegOptions,
+    RootResult,
+    Status,
+    default_ftol,
+    find_root,
+    newton_step,
+)
 from fdnt_xp.nulltests.tests import NullTests
 from fdnt_xp.shapes.centroid import starting_centroid, wide_weight
 from fdnt_xp.shapes.fdnt_gl import fit_pixels_of
@@ -36,7 +44,7 @@ from fdnt_xp.shapes.job import (
 from fdnt_xp.shapes.laguerre import check_order, n_coefficients
 from fdnt_xp.shapes.pixels import Pixels, check_pixels
 from fdnt_xp.shapes.results import ShapeResult
-from fdnt_xp.shapes.solution import describe_with, solution_of
+from fdnt_xp.shapes.solution import SolutionNoise, describe_with, solution_of
 from fdnt_xp.shapes.sources import (
     FittedStamps,
     Source,
@@ -51,6 +59,15 @@ TRANSFORMS: Final = ("ft", "gl", "hybrid")
 
 _FINE_ABOVE: Final = 1.5
 """`|eta|` beyond which the weight, squeezed by `exp(-|eta|/2)`, covers few cells of the k grid."""
+
+_COARSE_STEPS: Final = 12
+"""Steps of the root finder on the coarse grid: who converges there needs seldom more than 8."""
+_NEAR: Final = 0.3
+"""Of the root of ftol: a Newton step from there, whose error is a square, meets ftol."""
+_LONGEST: Final = 0.01
+"""Such a step, in units of eta and of L: a longer one is due to a Jacobian that is no guide."""
+_ROUNDING: Final = 10.0
+"""Times ftol: largest test after such a step."""
 
 
 def measure_shapes(
@@ -215,7 +232,9 @@ def _measure_source(job: Job, source: Source, pixels: Pixels, flags: Array) -> S
     xp = array_namespace(flags=flags)
     shape = pixels.stamp_shape
     measurable = xp.bitwise_and(flags, xp.full_like(flags, ~int(Flag.FILLED))) == 0
-    result, finer = _measure_on(job, job.coarse, source, shape, flags)
+    # Whoever is not there by then is measured again, and need not hold up a small batch.
+    few = replace(job, max_iter=min(job.max_iter, _COARSE_STEPS))
+    result, root, finer = _measure_on(few, job.coarse, source, shape, flags, last_step_free=True)
     finer = finer & measurable
     # A host read: how many need the fine grid decides the size of that batch.
     n_fine = int(xp.sum(xp.astype(finer, xp.int32)))
@@ -227,16 +246,30 @@ def _measure_source(job: Job, source: Source, pixels: Pixels, flags: Array) -> S
     for start in range(0, n_fine, per_chunk):
         rows = order[start : min(start + per_chunk, n_fine)]
         reasons = xp.take(flags, rows, axis=0) + int(Flag.FINE_GRID)
-        again, _ = _measure_on(job.take(rows), job.fine, source.take(rows), shape, reasons)
+        again, _, _ = _measure_on(
+            job.take(rows), job.fine, source.take(rows), shape, reasons, known=root.take(rows)
+        )
         parts.append(again)
     merged = ShapeResult.concat([*parts, result.take(order[n_fine:])])
     return merged.take(xp.argsort(order))
 
 
 def _measure_on(
-    job: Job, grid: KGrid, source: Source, stamp_shape: tuple[int, int], flags: Array
-) -> tuple[ShapeResult, Array]:
-    """Measure on one grid; return the shapes, and which a finer grid should measure again."""
+    job: Job,
+    grid: KGrid,
+    source: Source,
+    stamp_shape: tuple[int, int],
+    flags: Array,
+    *,
+    last_step_free: bool = False,
+    known: RootResult | None = None,
+) -> tuple[ShapeResult, RootResult, Array]:
+    """Measure on one grid; return shapes, roots, and which a finer grid should measure again.
+
+    Roots that are `known`, of a coarser grid, are where the search starts. With
+    `last_step_free` the last Newton step is taken without an evaluation of its own: the noise
+    evaluates the tests there anyhow. Where they show a poor step, there is no success.
+    """
     xp = array_namespace(flags=flags)
     inverse_transfer = job.psf.inverse_transfer(grid)
     galaxies = source.deconvolved(inverse_transfer, grid)
@@ -244,16 +277,40 @@ def _measure_on(
     tests = NullTests(
         grid=grid, galaxies=galaxies, weight=job.weight, length=job.length, fixed_width=fixed
     )
-    root = solve(job, tests, min(stamp_shape))
+    ftol = default_ftol(xp, galaxies.re.dtype)
+    near = _NEAR * math.sqrt(ftol) if last_step_free else ftol
+    root = solve(job, tests, min(stamp_shape), near, known)
+    if last_step_free:
+        step, _ = newton_step(xp, root.f, root.jac)
+        short = root.success & (xp.max(xp.abs(step), axis=-1) <= _LONGEST)
+        root = replace(root, x=xp.where(short[:, None], root.x + step, root.x))
     eta, centroid = solution_of(tests, root)
     noise = source.noise(tests, eta, centroid, inverse_transfer)
+    if last_step_free:
+        root = _looked_at(tests, root, noise, _ROUNDING * ftol)
     result = describe_with(tests, root, noise, stamp_shape=stamp_shape, flags=flags)
     elongated = eta[:, 0] ** 2 + eta[:, 1] ** 2 > _FINE_ABOVE**2
-    return result, elongated | ~root.success
+    return result, root, elongated | ~root.success
 
 
-def solve(job: Job, tests: NullTests, side: int) -> RootResult:
-    """Find the root of the null tests, from a round galaxy at its first centroid."""
+def _looked_at(tests: NullTests, root: RootResult, noise: SolutionNoise, ftol: float) -> RootResult:
+    """Return the roots with the tests evaluated there; those where they do not vanish failed."""
+    xp = array_namespace(x=root.x)
+    f, jac = tests.scaled(root.x[:, :2], noise.tests.tests, noise.tests.matched)
+    # Not `>`: the tests may be NaN.
+    missed = root.success & ~(xp.max(xp.abs(f), axis=-1) <= ftol)
+    status = xp.where(missed, xp.full_like(root.status, int(Status.MAX_ITER)), root.status)
+    return replace(root, f=f, jac=jac, status=status)
+
+
+def solve(
+    job: Job,
+    tests: NullTests,
+    side: int,
+    ftol: float | None = None,
+    known: RootResult | None = None,
+) -> RootResult:
+    """Find the root of the null tests, from one nearby or a round galaxy at its first centroid."""
     xp = array_namespace(kmax=job.weight.kmax)
     centre = starting_centroid(
         tests.grid,
@@ -263,7 +320,10 @@ def solve(job: Job, tests: NullTests, side: int) -> RootResult:
         reach=0.5 * side,
     )
     start = xp.concat([xp.zeros_like(centre), centre / job.length], axis=-1)
+    if known is not None:
+        start = xp.where(known.success[:, None], known.x, start)
     options = DoglegOptions(
+        ftol=ftol,
         max_iter=job.max_iter,
         initial_radius=1.0,
         max_radius=3.0,
@@ -293,4 +353,4 @@ def _galaxies_at_once(job: Job, pixels: Pixels, transform: Transform, order: int
     elif pixels.ivar is not None:
         more = 8 * N_FUNCTIONALS * ny * nx + 6 * N_FUNCTIONALS * grid.n_k
         more += 3 * n_coef**2 + n_coef * ny * nx if transform == "hybrid" else 0
-    return galaxies_at_once(grid, pixels.stamps, more)
+    return galaxies_at_once(grid, pixels.stamps, more, only_tests=more == 0)
