@@ -59,7 +59,7 @@ def eta_at(shrink, stamps, psf, shapes, monkeypatch):
         return replace(view, shrink=s, psf_factor=factor, psf_slope=slope)
 
     xp, stamps = check_stamps(stamps, psf)
-    job = prepare(xp, stamps, psf, 1, None, 50)
+    job = prepare(xp, stamps, psf, padding=1, max_iter=50)
     data = deconvolve(stamps, psf.inverse_transfer(job.coarse), job.coarse)
     tests = NullTests(grid=job.coarse, galaxies=data, weight=job.weight, length=1.0)
 

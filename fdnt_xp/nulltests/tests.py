@@ -123,6 +123,9 @@ class _View:
 class NullTests:
     """The null tests of a batch of galaxies: a `RootProblem` in `(eta1, eta2, x0/L, y0/L)`.
 
+    Shape and width are those in the frame of the weight, which may be the sky; centroid and
+    dipole stay in pixels, for a regular map makes no dipole vanish that did not.
+
     Parameters
     ----------
     grid : KGrid
@@ -257,7 +260,7 @@ class NullTests:
 
     def _view(self, eta: Array, centroid: Array) -> _View:
         xp = array_namespace(eta=eta)
-        forms = sheared_forms(eta)
+        forms = sheared_forms(eta, self.weight.frame)
         shrink = xp.exp(0.5 * xp.sqrt(eta[:, 0] ** 2 + eta[:, 1] ** 2))
         # Rounding can make a tiny q negative; it is a square.
         square = xp.matmul(forms.forms[0], self.grid.squares)
