@@ -212,7 +212,7 @@ class Psf:
         if int(unit.shape[0]) == 1:
             unit = xp.broadcast_to(unit, (self.n_psf, 2, 2))
         else:
-            rows, index = self._different(unit)
+            rows, index = self.pairs(unit)
             unit = xp.take(unit, rows, axis=0)
             numbers = xp.zeros_like(rows) if self.n_gal is None else self.numbers_of(rows)
             seen = replace(self, index=None).take(numbers)
@@ -228,10 +228,22 @@ class Psf:
             unit_jacobian=unit,
         )
 
-    def _different(self, unit: Array) -> tuple[Array, Array | None]:
-        """Return a galaxy with each pair of PSF and Jacobian, and which pair each galaxy has.
+    def pairs(self, unit: Array) -> tuple[Array, Array | None]:
+        """Return a galaxy with each different pair of a PSF and a Jacobian, and whose is which.
 
-        A host read: how many there are decides the size of the tables. No index if one.
+        A host read: how many there are decides the size of the tables.
+
+        Parameters
+        ----------
+        unit : array, shape (n_gal, 2, 2)
+            B of each galaxy.
+
+        Returns
+        -------
+        rows : array of int64, shape (n_pair,)
+            Number of a galaxy with each pair.
+        index : array of int64, shape (n_gal,), optional
+            Which pair each galaxy has; None if there is only one.
         """
         xp = array_namespace(unit=unit)
         numbers = np.zeros(int(unit.shape[0])) if self.n_gal is None else np.arange(self.n_gal)

@@ -155,7 +155,7 @@ def measure_shapes(
     _check_transform(transform, order, stamps)
     check_options(size=size, padding=padding, chunk_size=chunk_size)
     check_count("max_iter", max_iter, 0)
-    sky = None if jacobian is None else sky_frame(xp, stamps, jacobian)
+    sky = None if jacobian is None else sky_frame(xp, stamps, n_gal, jacobian)
     if n_gal == 0:
         empty = ShapeResult.unmeasured(stamps)
         return empty if sky is None else sky.on_sky(empty, pixels.stamp_shape)

@@ -13,6 +13,8 @@ from fdnt_xp.nulltests.dogleg import Status
 if TYPE_CHECKING:
     import numpy as np
     from astropy.table import Table
+
+    from fdnt_xp.shapes.psf_shapes import PsfShapes
 from fdnt_xp.shear import distortion_from_eta, reduced_shear_from_eta
 
 
@@ -148,12 +150,18 @@ class ShapeResult:
         named = {f.name: getattr(self, f.name) for f in fields(self)}
         return {name: column for name, column in named.items() if column is not None}
 
-    def to_table(self) -> Table:
+    def to_table(self, psf_shapes: PsfShapes | None = None) -> Table:
         """Return the result as an `astropy.table.Table`, with units and descriptions.
 
         Vectors are spread over scalar columns (`eta1`, `eta2`, ...), as survey catalogs
         have them; `e1`, `g1` and their companions are added, and `u` and `v` where there is
         a `sky_offset`. They and `size` then have no unit: it is that of the Jacobian.
+
+        Parameters
+        ----------
+        psf_shapes : PsfShapes, optional
+            Of the same galaxies, or one for all: `psf_eta1`, `psf_eta2` and `psf_size` are
+            added.
         """
         from astropy.table import Table
 
@@ -183,6 +191,9 @@ class ShapeResult:
         if host.sky_offset is not None:
             columns["u"], columns["v"] = host.sky_offset[:, 0], host.sky_offset[:, 1]
             described |= SKY_COLUMNS
+        if psf_shapes is not None:
+            columns |= psf_shapes.columns(self.n_gal)
+            described |= PSF_COLUMNS
         table = Table(columns)
         for name, (unit, description) in described.items():
             table[name].unit = unit
@@ -219,3 +230,10 @@ SKY_COLUMNS: dict[str, tuple[str | None, str]] = {
     "v": (None, "offset of the centroid from the centre of the stamp on the sky, along v"),
 }
 """Those that a Jacobian adds or changes; lengths are in its units."""
+
+PSF_COLUMNS: dict[str, tuple[str | None, str]] = {
+    "psf_eta1": (None, "conformal shear of the PSF, pixel response included, component 1"),
+    "psf_eta2": (None, "conformal shear of the PSF, pixel response included, component 2"),
+    "psf_size": (None, "sigma of the weight matched to the PSF, in the unit of size"),
+}
+"""Those of `fdnt_xp.shapes.psf_shapes.PsfShapes`."""

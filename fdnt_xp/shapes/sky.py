@@ -69,25 +69,31 @@ class SkyFrame:
         return replace(result, **kept, flags=xp.where(regular, result.flags, why))
 
 
-def sky_frame(xp: ModuleType, stamps: Array, jacobian: Array) -> SkyFrame:
-    """Check the Jacobians of stamps, and make those harmless that no galaxy can have.
+def sky_frame(xp: ModuleType, like: Array, n_gal: int, jacobian: Array) -> SkyFrame:
+    """Check the Jacobians of galaxies, and make those harmless that no galaxy can have.
+
+    Parameters
+    ----------
+    like : array
+        Of the library, dtype and device that they must have.
+    n_gal : int
+    jacobian : array, shape (2, 2) or (n_gal, 2, 2)
 
     Raises
     ------
     NamespaceError
-        If they are of another library, dtype or device than the stamps.
+        If they are of another library, dtype or device.
     ShapeMismatchError
-        If there is neither one, nor one for each stamp.
+        If there is neither one, nor one for each galaxy.
     FdntValueError
         If a single one for all is not regular.
     """
-    array_namespace(stamps=stamps, jacobian=jacobian)
+    array_namespace(stamps=like, jacobian=jacobian)
     jacobian = as_floating(xp, jacobian, "jacobian")
-    require_dtype(stamps.dtype, jacobian=jacobian)
-    n_gal = int(stamps.shape[0])
+    require_dtype(like.dtype, jacobian=jacobian)
     if tuple(jacobian.shape) not in ((2, 2), (n_gal, 2, 2)):
         raise ShapeMismatchError(
-            f"jacobian must have the shape (2, 2), or ({n_gal}, 2, 2) for {n_gal} stamps, "
+            f"jacobian must have the shape (2, 2), or ({n_gal}, 2, 2) for {n_gal} galaxies, "
             f"not {tuple(jacobian.shape)}"
         )
     single = jacobian.ndim == 2
@@ -97,6 +103,6 @@ def sky_frame(xp: ModuleType, stamps: Array, jacobian: Array) -> SkyFrame:
         raise FdntValueError(
             "jacobian must be finite and not singular: d(u, v)/d(x, y) of the pixels"
         )
-    unit = xp.eye(2, dtype=stamps.dtype, device=device_of(stamps))[None, :, :]
+    unit = xp.eye(2, dtype=like.dtype, device=device_of(like))[None, :, :]
     jacobian = xp.where(regular[:, None, None], jacobian, unit)
     return SkyFrame(jacobian=jacobian, regular=regular)
