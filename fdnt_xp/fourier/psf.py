@@ -33,6 +33,8 @@ _TABLE_NODES, _TABLE_ANGLES = 97, 24
 gives a valid null test. It must be smooth in k, which it is for any number of angles."""
 CIRCLES, CIRCLE_POINTS = 25, 24
 """Of the table of `|T|²` on circles, and points on half of each."""
+_UNIT_STEPS = 8192.0
+"""Of an entry of a unit Jacobian, to one: pixels that differ by less share tables."""
 _PSFS_AT_ONCE = 64
 """Bounds the memory of the trigonometric sums."""
 
@@ -198,8 +200,9 @@ class Psf:
     def through(self, jacobian: Array) -> Psf:
         """Return the PSFs with weights that are round on the sky.
 
-        The tables are made once for each different pair of a PSF and a unit Jacobian, so
-        that galaxies on pixels of one kind cost no more than without.
+        The tables are made once for each different pair of a PSF and a unit Jacobian, with
+        entries rounded to 1/8192: the weight needs to be the same for the same galaxy, and
+        smooth, not round to more than that. All else has the Jacobian as it is.
 
         Parameters
         ----------
@@ -209,6 +212,7 @@ class Psf:
         xp = array_namespace(image=self.image, jacobian=jacobian)
         unit = unit_jacobian(jacobian)
         seen, index = self, self.index
+        numbers = xp.arange(self.n_psf, dtype=xp.int64, device=device_of(unit))
         if int(unit.shape[0]) == 1:
             unit = xp.broadcast_to(unit, (self.n_psf, 2, 2))
         else:
@@ -216,12 +220,20 @@ class Psf:
             unit = xp.take(unit, rows, axis=0)
             numbers = xp.zeros_like(rows) if self.n_gal is None else self.numbers_of(rows)
             seen = replace(self, index=None).take(numbers)
-        kmax, weight, ln_power = _tables(seen.image, self.oversampling, self.floor, unit)
+        rounded = unit_jacobian(xp.round(unit * _UNIT_STEPS) / _UNIT_STEPS)
+        rows, table = _different(numbers, rounded)
+        kmax, weight, ln_power = _tables(
+            xp.take(seen.image, rows, axis=0),
+            self.oversampling,
+            self.floor,
+            xp.take(rounded, rows, axis=0),
+        )
+        kmax = xp.take(kmax, table, axis=0)
         return replace(
             seen,
             kmax=kmax,
-            weight=weight,
-            ln_power=ln_power,
+            weight=weight.take(table),
+            ln_power=xp.take(ln_power, table, axis=0),
             circle_kmax=kmax,
             largest_kmax=_largest(kmax * longest_stretch(unit)),
             index=index,
@@ -246,14 +258,10 @@ class Psf:
             Which pair each galaxy has; None if there is only one.
         """
         xp = array_namespace(unit=unit)
-        numbers = np.zeros(int(unit.shape[0])) if self.n_gal is None else np.arange(self.n_gal)
-        if self.index is not None:
-            numbers = to_numpy(self.index)
-        pairs = np.concatenate([numbers[:, None], to_numpy(unit).reshape(-1, 4)], axis=1)
-        _, first, pair = np.unique(pairs, axis=0, return_index=True, return_inverse=True)
-        like = {"dtype": xp.int64, "device": device_of(unit)}
-        index = None if len(first) == 1 else xp.asarray(pair.reshape(-1), **like)
-        return xp.asarray(first, **like), index
+        galaxies = xp.arange(int(unit.shape[0]), dtype=xp.int64, device=device_of(unit))
+        numbers = xp.zeros_like(galaxies) if self.n_gal is None else self.numbers_of(galaxies)
+        rows, index = _different(numbers, unit)
+        return rows, None if int(rows.shape[0]) == 1 else index
 
     def restricted(self, least_kmax: float) -> Psf:
         """Return the PSFs with those marked unusable whose weight ends before `least_kmax`.
@@ -403,6 +411,17 @@ def _waves(k: Array, n: int, oversampling: float) -> Array:
     xp = array_namespace(k=k)
     angle = k[:, None] * (_positions(n, k) / oversampling)[None, :]
     return xp.exp(complex_like(angle) * -1j)
+
+
+def _different(numbers: Array, matrices: Array) -> tuple[Array, Array]:
+    """Return a row with each different number and matrix, and which of those each row has."""
+    xp = array_namespace(matrices=matrices)
+    both = [to_numpy(numbers)[:, None], to_numpy(matrices).reshape(-1, 4)]
+    _, first, which = np.unique(
+        np.concatenate(both, axis=1), axis=0, return_index=True, return_inverse=True
+    )
+    like = {"dtype": xp.int64, "device": device_of(matrices)}
+    return xp.asarray(first, **like), xp.asarray(which.reshape(-1), **like)
 
 
 def _tables(

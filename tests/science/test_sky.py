@@ -61,8 +61,8 @@ def drawn():
 def test_a_galaxy_has_one_shape_through_any_pixels(name, drawn):
     shapes = fx.measure_shapes(drawn[0][name], drawn[1], jacobian=JACOBIANS)
     assert np.all(shapes.measured)
-    # Found: 6e-8, of sums over different modes of the sky.
-    np.testing.assert_allclose(shapes.eta - shapes.eta[0], 0.0, atol=3e-7)
+    # Sums over other modes of the sky: 6e-8. Jacobians rounded for the weights: 2e-7.
+    np.testing.assert_allclose(shapes.eta - shapes.eta[0], 0.0, atol=1e-6)
     np.testing.assert_allclose(shapes.sky_offset, [[0.06, -0.05]] * len(JACOBIANS), atol=1e-5)
     # The size is matched by a table, to 3e-6, in the units of each kind of pixel.
     np.testing.assert_allclose(shapes.size, shapes.size[0], rtol=1e-4)
