@@ -53,6 +53,8 @@ class Flag(IntFlag):
     """Pixels are missing: more than the method can do without, or all of them."""
     FILLED = 1 << 23
     """Missing pixels were filled from the others."""
+    BAD_JACOBIAN = 1 << 24
+    """The galaxy's own Jacobian is not finite, or singular."""
 
 
 INFORMATION: Final = (
@@ -101,4 +103,5 @@ _TEXT: Final[dict[str, str]] = {
     "LOST_IN_FRAME": "no centroid in a counter-sheared frame",
     "MASKED": "pixels missing",
     "FILLED": "missing pixels filled from the others",
+    "BAD_JACOBIAN": "Jacobian singular or not finite",
 }

@@ -7,6 +7,9 @@ array, of any size, finer sampled than the galaxies if `oversampling` says so.
 `𝒯(k) = <|T|^-2>_θ^-1` (B10, eq. 21, with the exponent corrected; docs, "Weight of the
 PSF") is the part of the null tests' weight that knows the PSF. It ends at `kmax`, where it
 falls below a floor or the grid ends, and it ends smoothly: a hard edge costs 1e-4 in e.
+
+Where shapes are those on the sky, so are the circles, and all of this is a function of the
+wave number there (`Psf.through`): the same for one PSF behind any pixels.
 """
 
 from __future__ import annotations
@@ -16,10 +19,11 @@ from types import ModuleType
 
 import numpy as np
 
-from fdnt_xp.arrays import Array, array_namespace, as_floating, device_of
+from fdnt_xp.arrays import Array, array_namespace, as_floating, device_of, to_numpy
 from fdnt_xp.errors import FdntTypeError, FdntValueError, RangeError, ShapeMismatchError
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.interpolation import CubicTable, cubic_table
+from fdnt_xp.fourier.jacobian import longest_stretch, unit_jacobian, wave_frame
 from fdnt_xp.fourier.transform import complex_like, half_plane_axes, mode_phase
 
 _SCAN_RADII, _SCAN_ANGLES = 48, 12
@@ -29,6 +33,8 @@ _TABLE_NODES, _TABLE_ANGLES = 97, 24
 gives a valid null test. It must be smooth in k, which it is for any number of angles."""
 CIRCLES, CIRCLE_POINTS = 25, 24
 """Of the table of `|T|²` on circles, and points on half of each."""
+_UNIT_STEPS = 8192.0
+"""Of an entry of a unit Jacobian, to one: pixels that differ by less share tables."""
 _PSFS_AT_ONCE = 64
 """Bounds the memory of the trigonometric sums."""
 
@@ -58,9 +64,14 @@ class Psf:
     oversampling : float
         Pixels of `image` per pixel of the galaxies, along one axis.
     largest_kmax : float
-        The largest `kmax`, on the host.
+        Radius of the disc on the pixels' k grid that holds all weights, on the host.
+    floor : float
+        Where `𝒯` ends; see `from_image`.
     index : array of int64, shape (n_gal,), optional
         Which PSF each galaxy has, where several share one.
+    unit_jacobian : array, shape (n_psf, 2, 2), optional
+        B of the galaxies' pixels (`fdnt_xp.fourier.jacobian`). With it `kmax`, `weight` and
+        `ln_power` are about wave numbers on the sky, in units of pixels as large as theirs.
     """
 
     image: Array
@@ -72,7 +83,9 @@ class Psf:
     circle_kmax: Array
     oversampling: float
     largest_kmax: float
+    floor: float = 1e-6
     index: Array | None = None
+    unit_jacobian: Array | None = None
 
     @classmethod
     def from_image(
@@ -131,26 +144,18 @@ class Psf:
         image, usable = _normalised(image)
         if single and not bool(xp.all(usable)):
             raise FdntValueError("image must be finite, with a positive sum, to serve as the PSF")
-        centre = _flux_centroid(image)
-        n_psf = int(image.shape[0])
-        parts = []
-        for start in range(0, max(n_psf, 1), _PSFS_AT_ONCE):
-            rows = slice(start, min(start + _PSFS_AT_ONCE, n_psf))
-            parts.append(_circularise(image[rows, :, :], float(oversampling), floor))
-        kmax = xp.concat([part[0] for part in parts])
-        weight = xp.concat([part[1] for part in parts])
-        ln_power = xp.concat([part[2] for part in parts])
+        kmax, weight, ln_power = _tables(image, float(oversampling), floor)
         return cls(
             image=image,
-            centre=centre / oversampling,
+            centre=_flux_centroid(image) / oversampling,
             kmax=kmax,
             usable=usable,
-            weight=cubic_table(weight, zero_beyond=True),
+            weight=weight,
             ln_power=ln_power,
             circle_kmax=kmax,
             oversampling=float(oversampling),
-            # In float32 pi is rounded up, past the Nyquist modes.
-            largest_kmax=min(float(xp.max(kmax)), np.pi) if n_psf else np.pi,
+            largest_kmax=_largest(kmax),
+            floor=floor,
             index=index,
         )
 
@@ -166,6 +171,11 @@ class Psf:
             return int(self.index.shape[0])
         return None if self.n_psf == 1 else self.n_psf
 
+    @property
+    def frame(self) -> Array | None:
+        """A, which takes k of the image to that of the sky, shape (n_psf, 2, 2); see `through`."""
+        return None if self.unit_jacobian is None else wave_frame(self.unit_jacobian)
+
     def numbers_of(self, rows: Array) -> Array:
         """Return which PSF each of the given galaxies (integer array) has."""
         xp = array_namespace(image=self.image, rows=rows)
@@ -175,7 +185,10 @@ class Psf:
         """Return the PSFs of the given galaxies (integer array), one for each."""
         xp = array_namespace(image=self.image, rows=rows)
         numbers = self.numbers_of(rows)
+        moved: tuple[str, ...]
         moved = ("image", "centre", "kmax", "usable", "ln_power", "circle_kmax")
+        if self.unit_jacobian is not None:
+            moved += ("unit_jacobian",)
         taken = {name: xp.take(getattr(self, name), numbers, axis=0) for name in moved}
         return replace(self, **taken, weight=self.weight.take(numbers), index=None)
 
@@ -184,9 +197,81 @@ class Psf:
         xp = array_namespace(image=self.image)
         return replace(self, index=_checked_index(xp, self.image, psf_index))
 
+    def through(self, jacobian: Array) -> Psf:
+        """Return the PSFs with weights that are round on the sky.
+
+        The tables are made once for each different pair of a PSF and a unit Jacobian, with
+        entries rounded to 1/8192: the weight needs to be the same for the same galaxy, and
+        smooth, not round to more than that. All else has the Jacobian as it is.
+
+        Parameters
+        ----------
+        jacobian : array, shape (1, 2, 2) or (n_gal, 2, 2)
+            Of the galaxies' pixels; regular.
+        """
+        xp = array_namespace(image=self.image, jacobian=jacobian)
+        unit = unit_jacobian(jacobian)
+        seen, index = self, self.index
+        numbers = xp.arange(self.n_psf, dtype=xp.int64, device=device_of(unit))
+        if int(unit.shape[0]) == 1:
+            unit = xp.broadcast_to(unit, (self.n_psf, 2, 2))
+        else:
+            rows, index = self.pairs(unit)
+            unit = xp.take(unit, rows, axis=0)
+            numbers = xp.zeros_like(rows) if self.n_gal is None else self.numbers_of(rows)
+            seen = replace(self, index=None).take(numbers)
+        rounded = unit_jacobian(xp.round(unit * _UNIT_STEPS) / _UNIT_STEPS)
+        rows, table = _different(numbers, rounded)
+        kmax, weight, ln_power = _tables(
+            xp.take(seen.image, rows, axis=0),
+            self.oversampling,
+            self.floor,
+            xp.take(rounded, rows, axis=0),
+        )
+        kmax = xp.take(kmax, table, axis=0)
+        return replace(
+            seen,
+            kmax=kmax,
+            weight=weight.take(table),
+            ln_power=xp.take(ln_power, table, axis=0),
+            circle_kmax=kmax,
+            largest_kmax=_largest(kmax * longest_stretch(unit)),
+            index=index,
+            unit_jacobian=unit,
+        )
+
+    def pairs(self, unit: Array) -> tuple[Array, Array | None]:
+        """Return a galaxy with each different pair of a PSF and a Jacobian, and whose is which.
+
+        A host read: how many there are decides the size of the tables.
+
+        Parameters
+        ----------
+        unit : array, shape (n_gal, 2, 2)
+            B of each galaxy.
+
+        Returns
+        -------
+        rows : array of int64, shape (n_pair,)
+            Number of a galaxy with each pair.
+        index : array of int64, shape (n_gal,), optional
+            Which pair each galaxy has; None if there is only one.
+        """
+        xp = array_namespace(unit=unit)
+        galaxies = xp.arange(int(unit.shape[0]), dtype=xp.int64, device=device_of(unit))
+        numbers = xp.zeros_like(galaxies) if self.n_gal is None else self.numbers_of(galaxies)
+        rows, index = _different(numbers, unit)
+        return rows, None if int(rows.shape[0]) == 1 else index
+
     def restricted(self, least_kmax: float) -> Psf:
-        """Return the PSFs with those marked unusable whose weight ends before `least_kmax`."""
-        return replace(self, usable=self.usable & (self.kmax >= least_kmax))
+        """Return the PSFs with those marked unusable whose weight ends before `least_kmax`.
+
+        On the sky it ends in an ellipse on the k grid, whose narrow side counts.
+        """
+        reach = self.kmax
+        if self.unit_jacobian is not None:
+            reach = reach / longest_stretch(self.unit_jacobian)
+        return replace(self, usable=self.usable & (reach >= least_kmax))
 
     def ending_at(self, floor: float) -> Psf:
         """Return the PSFs with weights that end where `𝒯` falls below a higher floor.
@@ -207,6 +292,7 @@ class Psf:
             kmax=kmax,
             weight=cubic_table(_ended_smoothly(power, t), zero_beyond=True),
             largest_kmax=float(xp.max(kmax)) if self.n_psf else self.largest_kmax,
+            floor=max(floor, self.floor),
         )
 
     def transfer(self, grid: KGrid) -> Array:
@@ -221,7 +307,7 @@ class Psf:
         )
 
     def inverse_transfer(self, grid: KGrid) -> Array:
-        """Return `1/T(k)` inside each PSF's own disc `|k| < kmax`, and zero outside.
+        """Return `1/T(k)` inside each PSF's own disc `|k| < kmax` (on the sky), zero outside.
 
         Returns
         -------
@@ -229,8 +315,12 @@ class Psf:
         """
         xp = array_namespace(image=self.image)
         transfer = self.transfer(grid)
-        radius = xp.sqrt(grid.kx**2 + grid.ky**2)
-        inside = (radius[None, :] < self.kmax[:, None]) & (xp.abs(transfer) > 0)
+        kx, ky = grid.kx[None, :], grid.ky[None, :]
+        frame = self.frame
+        if frame is not None:
+            kx, ky = (frame[:, i, 0:1] * kx + frame[:, i, 1:2] * ky for i in (0, 1))
+        radius = xp.sqrt(kx**2 + ky**2)
+        inside = (radius < self.kmax[:, None]) & (xp.abs(transfer) > 0)
         one = xp.ones_like(transfer)
         return xp.where(inside, one / xp.where(inside, transfer, one), xp.zeros_like(transfer))
 
@@ -323,31 +413,81 @@ def _waves(k: Array, n: int, oversampling: float) -> Array:
     return xp.exp(complex_like(angle) * -1j)
 
 
-def _circularise(image: Array, oversampling: float, floor: float) -> tuple[Array, Array, Array]:
+def _different(numbers: Array, matrices: Array) -> tuple[Array, Array]:
+    """Return a row with each different number and matrix, and which of those each row has."""
+    xp = array_namespace(matrices=matrices)
+    both = [to_numpy(numbers)[:, None], to_numpy(matrices).reshape(-1, 4)]
+    _, first, which = np.unique(
+        np.concatenate(both, axis=1), axis=0, return_index=True, return_inverse=True
+    )
+    like = {"dtype": xp.int64, "device": device_of(matrices)}
+    return xp.asarray(first, **like), xp.asarray(which.reshape(-1), **like)
+
+
+def _tables(
+    image: Array, oversampling: float, floor: float, unit: Array | None = None
+) -> tuple[Array, CubicTable, Array]:
+    """Return `kmax`, `𝒯` and `ln |T|²` on circles of stars of unit flux.
+
+    Parameters
+    ----------
+    image : array, shape (n_psf, ny, nx)
+    oversampling, floor : float
+    unit : array, shape (n_psf, 2, 2), optional
+        B, where the circles are those of the sky.
+    """
+    xp = array_namespace(image=image)
+    n_psf = int(image.shape[0])
+    parts = []
+    for start in range(0, max(n_psf, 1), _PSFS_AT_ONCE):
+        rows = slice(start, min(start + _PSFS_AT_ONCE, n_psf))
+        some = None if unit is None else unit[rows, :, :]
+        parts.append(_circularise(image[rows, :, :], oversampling, floor, some))
+    kmax, power, ln_power = (xp.concat(part) for part in zip(*parts, strict=True))
+    return kmax, cubic_table(power, zero_beyond=True), ln_power
+
+
+def _largest(kmax: Array) -> float:
+    """Return the largest radius on the host, that of the whole grid where there is none."""
+    xp = array_namespace(kmax=kmax)
+    # In float32 pi is rounded up, past the Nyquist modes.
+    return min(float(xp.max(kmax)), np.pi) if int(kmax.shape[0]) else np.pi
+
+
+def _circularise(
+    image: Array, oversampling: float, floor: float, unit: Array | None
+) -> tuple[Array, Array, Array]:
     """Return `kmax`, shape (n_psf,), `𝒯` at the table's nodes, and `ln |T|²` on circles."""
     xp = array_namespace(image=image)
     like = {"dtype": image.dtype, "device": device_of(image)}
     scan = xp.linspace(0.0, np.pi, _SCAN_RADII, **like)[None, :]
-    kmax = _first_crossing(scan, _mean_power(image, scan, _SCAN_ANGLES, oversampling), floor)
+    if unit is not None:
+        # A circle of the sky is an ellipse on the grid, and must not reach out of that.
+        scan = scan / longest_stretch(unit)[:, None]
+    kmax = _first_crossing(scan, _mean_power(image, scan, _SCAN_ANGLES, oversampling, unit), floor)
     t = xp.linspace(0.0, 1.0, _TABLE_NODES, **like)[None, :]
-    power = _mean_power(image, kmax[:, None] * t, _TABLE_ANGLES, oversampling)
+    power = _mean_power(image, kmax[:, None] * t, _TABLE_ANGLES, oversampling, unit)
     circles = xp.linspace(0.0, 1.0, CIRCLES, **like)[None, :]
-    on_circles = power_on_circles(image, kmax[:, None] * circles, CIRCLE_POINTS, oversampling)
+    on_circles = power_on_circles(image, kmax[:, None] * circles, CIRCLE_POINTS, oversampling, unit)
     # Where a PSF is dark there is no logarithm; the weight ends before.
     least = xp.full_like(on_circles, float(xp.finfo(image.dtype).smallest_normal))
     return kmax, _ended_smoothly(power, t), xp.log(xp.maximum(on_circles, least))
 
 
-def _mean_power(image: Array, radii: Array, n_angle: int, oversampling: float) -> Array:
+def _mean_power(
+    image: Array, radii: Array, n_angle: int, oversampling: float, unit: Array | None
+) -> Array:
     """Return `<|T|^-2>_θ^-1` on circles, shape (n_psf, n_radius)."""
     xp = array_namespace(image=image)
-    power = power_on_circles(image, radii, n_angle, oversampling)
+    power = power_on_circles(image, radii, n_angle, oversampling, unit)
     dark = xp.any(power <= 0, axis=-1)
     inverse = xp.mean(1.0 / xp.where(power > 0, power, xp.ones_like(power)), axis=-1)
     return xp.where(dark, xp.zeros_like(inverse), 1.0 / inverse)
 
 
-def power_on_circles(image: Array, radii: Array, n_angle: int, oversampling: float) -> Array:
+def power_on_circles(
+    image: Array, radii: Array, n_angle: int, oversampling: float, unit: Array | None = None
+) -> Array:
     """Return `|T|²` of images on circles, shape (n, n_radius, n_angle).
 
     `|T|` is the same at k and -k, so half a circle is enough; on equidistant points of it
@@ -362,6 +502,8 @@ def power_on_circles(image: Array, radii: Array, n_angle: int, oversampling: flo
         Angles `π (j + ½)/n_angle`.
     oversampling : float
         Pixels of `image` per pixel of the galaxies.
+    unit : array, shape (n or 1, 2, 2), optional
+        B, where the circles are those of the sky: `k = Bᵀ k_sky`.
     """
     xp = array_namespace(image=image)
     ny, nx = image.shape[1:]
@@ -372,6 +514,8 @@ def power_on_circles(image: Array, radii: Array, n_angle: int, oversampling: flo
     points = (int(radii.shape[0]), n_radius * n_angle, 1)
     kx = xp.reshape(radii[:, :, None] * cos, points)
     ky = xp.reshape(radii[:, :, None] * sin, points)
+    if unit is not None:
+        kx, ky = (unit[:, 0:1, j : j + 1] * kx + unit[:, 1:2, j : j + 1] * ky for j in (0, 1))
     phase_x = kx * (_positions(nx, image) / oversampling)
     phase_y = ky * (_positions(ny, image) / oversampling)
     cos_y, sin_y = xp.cos(phase_y), xp.sin(phase_y)

@@ -10,6 +10,9 @@ alone (docs, "Sheared moments are moments")::
 
 with `N = eta1 sz + eta2 sx`, `shc = sinh|eta|/|eta|` and `chc = (cosh|eta| - 1)/|eta|²`.
 A form is stored as its coefficients of `kx², kx ky, ky²`, shape (n_gal, 3).
+
+Where the shape is that on the sky, `k' = S_eta A k` with `A = B⁻ᵀ` the frame of the galaxy's
+pixels (`fdnt_xp.fourier.jacobian`), and each form is `AᵀF A`: still one of the same k.
 """
 
 from __future__ import annotations
@@ -36,8 +39,15 @@ class ShearedForms:
     slopes: tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]
 
 
-def sheared_forms(eta: Array) -> ShearedForms:
-    """Return the forms at `eta`, shape (n_gal, 2)."""
+def sheared_forms(eta: Array, frame: Array | None = None) -> ShearedForms:
+    """Return the forms at `eta`.
+
+    Parameters
+    ----------
+    eta : array, shape (n_gal, 2)
+    frame : array, shape (n_gal or 1, 2, 2), optional
+        A, where eta is a shape in another frame than that of the pixels.
+    """
     xp = array_namespace(eta=eta)
     eta1, eta2 = eta[:, 0], eta[:, 1]
     square = eta1**2 + eta2**2
@@ -47,7 +57,8 @@ def sheared_forms(eta: Array) -> ShearedForms:
 
     def form(identity: Array, plus: Array, cross: Array) -> Array:
         """Return `identity I + plus sz + cross sx` as coefficients."""
-        return xp.stack([identity + plus, 2.0 * cross, identity - plus], axis=-1)
+        coefficients = xp.stack([identity + plus, 2.0 * cross, identity - plus], axis=-1)
+        return coefficients if frame is None else seen_through(coefficients, frame)
 
     def quadrupole_slope(i: int, j: int) -> Array:
         """Return dF_i/deta_j of `F_i = s_i + shc eta_i I + chc eta_i N`, i = 1, 2."""
@@ -79,6 +90,28 @@ def sheared_forms(eta: Array) -> ShearedForms:
             (square_slope(1), quadrupole_slope(1, 1), quadrupole_slope(2, 1)),
             (square_slope(2), quadrupole_slope(1, 2), quadrupole_slope(2, 2)),
         ),
+    )
+
+
+def seen_through(form: Array, frame: Array) -> Array:
+    """Return the form `AᵀF A` of k, where F is one of `A k`; shape (n_gal, 3).
+
+    Parameters
+    ----------
+    form : array, shape (n_gal or 1, 3)
+    frame : array, shape (n_gal or 1, 2, 2)
+        A.
+    """
+    xp = array_namespace(form=form, frame=frame)
+    xx, xy, yy = form[:, 0], form[:, 1], form[:, 2]
+    a, b, c, d = (frame[:, i, j] for i in (0, 1) for j in (0, 1))
+    return xp.stack(
+        [
+            xx * a**2 + xy * a * c + yy * c**2,
+            2.0 * xx * a * b + xy * (a * d + b * c) + 2.0 * yy * c * d,
+            xx * b**2 + xy * b * d + yy * d**2,
+        ],
+        axis=-1,
     )
 
 

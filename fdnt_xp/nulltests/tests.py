@@ -169,6 +169,9 @@ _Parts = TypeVar("_Parts", _Moments, _Width, _PowerMoments)
 class NullTests:
     """The null tests of a batch of galaxies: a `RootProblem` in `(eta1, eta2, x0/L, y0/L)`.
 
+    Shape and width are those in the frame of the weight, which may be the sky; centroid and
+    dipole stay in pixels, for a regular map makes no dipole vanish that did not.
+
     Parameters
     ----------
     grid : KGrid
@@ -238,7 +241,7 @@ class NullTests:
         centroid : array, shape (n_gal, 2)
             Pixels from the centre of the stamp.
         """
-        frame = _Frame(forms=sheared_forms(eta), shrink=shrink_factor(eta))
+        frame = _Frame(forms=sheared_forms(eta, self.weight.frame), shrink=shrink_factor(eta))
         moments, width, _ = self._moments(frame, centroid)
         matched = self._matched_width(frame, moments, width)
         return self._tests(frame, moments, width.width), matched
@@ -256,7 +259,7 @@ class NullTests:
         inverse_power : array, shape (n_gal or 1, n_k)
             `1/|T|²`: noise power of the deconvolved image for unit noise power per mode.
         """
-        frame = _Frame(forms=sheared_forms(eta), shrink=shrink_factor(eta))
+        frame = _Frame(forms=sheared_forms(eta, self.weight.frame), shrink=shrink_factor(eta))
         moments, width, power = self._moments(frame, centroid, inverse_power)
         assert power is not None  # as inverse_power was given
         matched = self._matched_width(frame, moments, width)

@@ -24,6 +24,7 @@ from fdnt_xp.arrays import Array, Rows, array_namespace, device_of, rows_of
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.interpolation import CubicTable, cubic_table
 from fdnt_xp.fourier.psf import Psf
+from fdnt_xp.nulltests.forms import seen_through
 
 _QUADRATURE: Final = 96
 """Gauss-Legendre nodes of the integrals over k in the size equation."""
@@ -77,11 +78,15 @@ class Weight:
         Where `𝒯` ends, rad/pixel.
     widths : WidthTable, optional
         What `matched_width` needs.
+    frame : array, shape (n_psf, 2, 2), optional
+        A: the weight is a function of `|A k|`, the wave number on the sky. That of the
+        pixels without it.
     """
 
     psf_part: CubicTable
     kmax: Array
     widths: WidthTable | None = None
+    frame: Array | None = None
 
     def take(self, rows: Rows) -> Weight:
         """Return the weights with the given row numbers; a shared one stays."""
@@ -91,6 +96,7 @@ class Weight:
             psf_part=self.psf_part.take(rows),
             kmax=rows_of(self.kmax, rows),
             widths=None if self.widths is None else self.widths.take(rows),
+            frame=None if self.frame is None else rows_of(self.frame, rows),
         )
 
     def shrunk(self, factor: float) -> Weight:
@@ -135,6 +141,12 @@ class Weight:
         xp = array_namespace(kmax=self.kmax)
         shrink = xp.ones_like(self.kmax) if shrink is None else shrink
         square = (grid.kx**2 + grid.ky**2)[None, :]
+        if self.frame is not None:
+            one = xp.ones_like(self.kmax)
+            form = seen_through(xp.stack([one, xp.zeros_like(one), one], axis=-1), self.frame)
+            square = xp.matmul(form, grid.squares)
+            # Rounding can make a tiny q negative; it is a square.
+            square = xp.maximum(square, xp.zeros_like(square))
         square = xp.broadcast_to(square, (int(self.kmax.shape[0]), grid.n_k))
         psf_factor, _ = self.psf_factor(square, shrink)
         return psf_factor * xp.exp(-0.5 * size**2 * square)
@@ -191,7 +203,7 @@ def make_weight(psf: Psf, largest_size: float | None = None) -> Weight:
         Largest sigma, pixels, to which the size can be matched. Not at all by default.
     """
     widths = None if largest_size is None else _width_table(psf, largest_size)
-    return Weight(psf_part=psf.weight, kmax=psf.kmax, widths=widths)
+    return Weight(psf_part=psf.weight, kmax=psf.kmax, widths=widths, frame=psf.frame)
 
 
 def _width_table(psf: Psf, largest_size: float) -> WidthTable:

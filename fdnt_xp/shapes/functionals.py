@@ -37,7 +37,8 @@ def null_test_functionals(tests: NullTests, eta: Array, noise: TestNoise) -> Arr
     xp = array_namespace(eta=eta)
     grid, matched = tests.grid, noise.matched
     squares = grid.fold * grid.squares
-    square, plus, cross = (xp.matmul(form, squares) for form in sheared_forms(eta).forms)
+    forms = sheared_forms(eta, tests.weight.frame).forms
+    square, plus, cross = (xp.matmul(form, squares) for form in forms)
     plain = square / grid.fold
     plain = xp.maximum(plain, xp.zeros_like(plain))
     shrink = xp.exp(0.5 * xp.sqrt(eta[:, 0] ** 2 + eta[:, 1] ** 2))

@@ -68,7 +68,7 @@ class Job:
         The grid of the stamps, and one `FINER` times finer.
     length : float
         Unit of centroids, pixels: about the size of the PSF.
-    size : float or None
+    size : array, shape (1,) or (n_gal,), or None
         Fixed size of the weight, pixels.
     max_iter : int
         Steps of the root finder.
@@ -79,7 +79,7 @@ class Job:
     coarse: KGrid
     fine: KGrid
     length: float
-    size: float | None
+    size: Array | None
     max_iter: int
 
     def chunks(self, n_gal: int, n_chunk: int) -> list[Chunk]:
@@ -110,7 +110,8 @@ class Job:
         xp = array_namespace(kmax=self.psf.kmax)
         number = xp.asarray([chunk.psf_number], dtype=xp.int64, device=device_of(self.psf.kmax))
         psf = replace(self.psf, index=None).take(number)
-        return replace(self, psf=psf, weight=self.weight.take(number))
+        size = _of_rows(self.size, chunk.rows)
+        return replace(self, psf=psf, weight=self.weight.take(number), size=size)
 
     def first(self, n_gal: int) -> Job:
         """Return the job of the first galaxies."""
@@ -120,14 +121,25 @@ class Job:
 
     def take(self, rows: Rows) -> Job:
         """Return the job of the given galaxies, with a PSF for each where there are several."""
+        size = _of_rows(self.size, rows)
         if self.weight.shared:
-            return self
+            return replace(self, size=size)
         if isinstance(rows, slice):
             xp = array_namespace(kmax=self.psf.kmax)
             device = device_of(self.psf.kmax)
             rows = xp.arange(rows.start, rows.stop, dtype=xp.int64, device=device)
         numbers = self.psf.numbers_of(rows)
-        return replace(self, psf=self.psf.take(rows), weight=self.weight.take(numbers))
+        return replace(self, psf=self.psf.take(rows), weight=self.weight.take(numbers), size=size)
+
+
+def _of_rows(size: Array | None, rows: Rows) -> Array | None:
+    """Return the sizes of the given galaxies; one for all stays."""
+    if size is None or int(size.shape[0]) == 1:
+        return size
+    if isinstance(rows, slice):
+        return size[rows]
+    xp = array_namespace(size=size)
+    return xp.take(size, rows, axis=0)
 
 
 def in_order(chunks: list[Chunk]) -> Array | None:
@@ -181,7 +193,7 @@ def prepare(
     psf: Psf,
     *,
     padding: int,
-    size: float | None = None,
+    size: Array | None = None,
     matched: bool = True,
     max_iter: int = 0,
 ) -> Job:

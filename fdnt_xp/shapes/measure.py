@@ -5,15 +5,17 @@ pixels -> transform, divided by T        shapes.sources: of the stamps, or of fi
        -> root of the five null tests    nulltests
        -> once more on a finer k grid for the few that need it
        -> covariance, flux, flags        shapes.solution
+       -> lengths on the sky             shapes.sky, where there are Jacobians
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import ModuleType
 from typing import Final, Literal, TypeAlias
 
-from fdnt_xp.arrays import Array, array_namespace
+from fdnt_xp.arrays import Array, array_namespace, device_of
 from fdnt_xp.errors import FdntValueError
 from fdnt_xp.flags import Flag
 from fdnt_xp.fourier.grid import KGrid
@@ -44,6 +46,7 @@ from fdnt_xp.shapes.job import (
 from fdnt_xp.shapes.laguerre import check_order, n_coefficients
 from fdnt_xp.shapes.pixels import Pixels, check_pixels
 from fdnt_xp.shapes.results import ShapeResult
+from fdnt_xp.shapes.sky import SkyFrame, sky_frame
 from fdnt_xp.shapes.solution import SolutionNoise, describe_with, solution_of
 from fdnt_xp.shapes.sources import (
     FittedStamps,
@@ -52,6 +55,7 @@ from fdnt_xp.shapes.sources import (
     WhiteStamps,
     filled_stamps,
 )
+from fdnt_xp.shear import eta_from_matrix, shear_matrix
 
 Transform: TypeAlias = Literal["ft", "gl", "hybrid"]
 TRANSFORMS: Final = ("ft", "gl", "hybrid")
@@ -76,6 +80,7 @@ def measure_shapes(
     *,
     noise_variance: float | Array | None = None,
     ivar: Array | None = None,
+    jacobian: Array | None = None,
     transform: Transform = "ft",
     order: int = 12,
     size: float | None = None,
@@ -101,6 +106,11 @@ def measure_shapes(
     ivar : array, shape (n_gal, ny, nx), optional
         In place of `noise_variance` the inverse variance of each pixel, 0 where it is
         missing: what such a pixel holds, be it NaN, is not looked at.
+    jacobian : array, shape (2, 2) or (n_gal, 2, 2), optional
+        `d(u, v)/d(x, y)`: what a step along the pixels is on the sky, in any unit, for all
+        stamps or for each. Shapes, their errors and sizes are then those in (u, v), angles
+        counted from u towards v, and the weight is round there: see docs, "Sky coordinates".
+        The centroid is given in both frames.
     transform : {"ft", "gl", "hybrid"}
         Whose transform the tests are made of. "ft": that of the stamp; galaxies with
         missing pixels are flagged `MASKED`. "gl": that of a Gauss-Laguerre fit to the
@@ -109,8 +119,8 @@ def measure_shapes(
     order : int
         Of the fits, 0 to 20: they have (order + 1)(order + 2)/2 coefficients.
     size : float, optional
-        Fixes the size sigma of the Gaussian part of the weight, pixels, in the frame where
-        the galaxy is round. By default it is matched to each galaxy.
+        Fixes the size sigma of the Gaussian part of the weight, in pixels or units of the
+        sky, in the frame where the galaxy is round. By default it is matched to each galaxy.
     padding : int
         Makes the k grid finer by this factor for all galaxies. Without it only the most
         elongated are measured on a grid twice as fine, and with "gl" all.
@@ -125,20 +135,21 @@ def measure_shapes(
     ShapeResult
         Row i belongs to stamp i; an empty batch gives an empty result. A galaxy with a
         negative or infinite `ivar` or a NaN in it is flagged `NON_FINITE_PIXEL`, one whose
-        pixels do not carry a fit of the order `GL_FAILURE`, one without pixels `MASKED`.
+        pixels do not carry a fit of the order `GL_FAILURE`, one without pixels `MASKED`, one
+        whose own Jacobian is not finite or singular `BAD_JACOBIAN`.
 
     Raises
     ------
     FdntTypeError, NamespaceError
-        If `stamps` is no array or `psf` no `Psf`; if they, `noise_variance` or `ivar` are
-        of two libraries, dtypes or devices.
+        If `stamps` is no array or `psf` no `Psf`; if they, `noise_variance`, `ivar` or
+        `jacobian` are of two libraries, dtypes or devices.
     ShapeMismatchError
         If `stamps` has not three axes, or another number of rows than `psf` has PSFs, or
-        `ivar` another shape.
+        `ivar` or `jacobian` another shape.
     FdntValueError, RangeError
         If a number is out of range, no stamp has as many pixels as the fit coefficients,
-        both `noise_variance` and `ivar` are given, there is no such transform, or the PSF
-        is so wide that the stamps resolve nothing.
+        both `noise_variance` and `ivar` are given, there is no such transform, the one
+        Jacobian of all is singular, or the PSF is so wide that the stamps resolve nothing.
 
     References
     ----------
@@ -161,17 +172,33 @@ def measure_shapes(
     _check_transform(transform, order, stamps)
     check_options(size=size, padding=padding, chunk_size=chunk_size)
     check_count("max_iter", max_iter, 0)
+    sky = None if jacobian is None else sky_frame(xp, stamps, n_gal, jacobian)
     if n_gal == 0:
-        return ShapeResult.unmeasured(stamps)
+        empty = ShapeResult.unmeasured(stamps)
+        return empty if sky is None else sky.on_sky(empty, pixels.stamp_shape)
 
-    job = prepare(xp, stamps, psf, padding=padding, size=size, max_iter=max_iter)
+    seen = psf if sky is None else sky.seen_by(psf)
+    fixed = _fixed_size(xp, stamps, size, sky)
+    job = prepare(xp, stamps, seen, padding=padding, size=fixed, max_iter=max_iter)
     n_chunk = chunk_size or _galaxies_at_once(job, pixels, transform, order)
     chunks = job.chunks(n_gal, n_chunk)
     result = ShapeResult.concat(
         [_measure_chunk(job.of(part), pixels.take(part.rows), transform, order) for part in chunks]
     )
     place = in_order(chunks)
-    return result if place is None else result.take(place)
+    result = result if place is None else result.take(place)
+    return result if sky is None else sky.on_sky(result, pixels.stamp_shape)
+
+
+def _fixed_size(
+    xp: ModuleType, stamps: Array, size: float | None, sky: SkyFrame | None
+) -> Array | None:
+    """Return the size of the weight that was given, in pixels; one, or one for each galaxy."""
+    if size is None:
+        return None
+    if sky is None:
+        return xp.full((1,), float(size), dtype=stamps.dtype, device=device_of(stamps))
+    return float(size) / sky.scale
 
 
 def _measure_chunk(job: Job, pixels: Pixels, transform: Transform, order: int) -> ShapeResult:
@@ -273,7 +300,7 @@ def _measure_on(
     xp = array_namespace(flags=flags)
     inverse_transfer = job.psf.inverse_transfer(grid)
     galaxies = source.deconvolved(inverse_transfer, grid)
-    fixed = None if job.size is None else xp.full_like(galaxies.re[:, 0], job.size**2)
+    fixed = None if job.size is None else xp.broadcast_to(job.size**2, flags.shape)
     tests = NullTests(
         grid=grid, galaxies=galaxies, weight=job.weight, length=job.length, fixed_width=fixed
     )
@@ -289,8 +316,20 @@ def _measure_on(
     if last_step_free:
         root = _looked_at(tests, root, noise, _ROUNDING * ftol)
     result = describe_with(tests, root, noise, stamp_shape=stamp_shape, flags=flags)
-    elongated = eta[:, 0] ** 2 + eta[:, 1] ** 2 > _FINE_ABOVE**2
-    return result, root, elongated | ~root.success
+    return result, root, (_squeezed(eta, job.weight.frame) > _FINE_ABOVE) | ~root.success
+
+
+def _squeezed(eta: Array, frame: Array | None) -> Array:
+    """Return how much narrower than its disc the weight is on the k grid: ln of the ratio.
+
+    `|eta|` on the pixels' own frame: half by the shrink factor, half by the shear.
+    """
+    xp = array_namespace(eta=eta)
+    norm = xp.sqrt(eta[:, 0] ** 2 + eta[:, 1] ** 2)
+    if frame is None:
+        return norm
+    on_grid = eta_from_matrix(xp.matmul(shear_matrix(eta), frame))
+    return 0.5 * (norm + xp.sqrt(on_grid[:, 0] ** 2 + on_grid[:, 1] ** 2))
 
 
 def _looked_at(tests: NullTests, root: RootResult, noise: SolutionNoise, ftol: float) -> RootResult:

@@ -13,6 +13,8 @@ from fdnt_xp.nulltests.dogleg import Status
 if TYPE_CHECKING:
     import numpy as np
     from astropy.table import Table
+
+    from fdnt_xp.shapes.psf_shapes import PsfShapes
 from fdnt_xp.shear import distortion_from_eta, reduced_shear_from_eta
 
 
@@ -22,7 +24,8 @@ class ShapeResult:
 
     All arrays share one library, dtype and device, that of the stamps; row i is galaxy i.
     Where `flags` holds a bit of `fdnt_xp.flags.FAILED`, the float columns but
-    `masked_fraction` are NaN.
+    `masked_fraction` are NaN. Where a Jacobian was given, shapes are those on the sky, and
+    lengths in its units but for `centroid`.
 
     Parameters
     ----------
@@ -35,8 +38,8 @@ class ShapeResult:
     centroid : array, shape (n_gal, 2)
         (x, y) in pixels of the stamp, 0-based, integer at pixel centres.
     size : array, shape (n_gal,)
-        sigma_g of the Gaussian factor of the weight, in pixels, in the frame where the
-        galaxy is round.
+        sigma_g of the Gaussian factor of the weight, in the frame where the galaxy is
+        round; in pixels, or in the units of the sky.
     flux : array, shape (n_gal,)
         Amplitude of the best Gaussian galaxy of this size and shape, in units of the image.
     snr : array, shape (n_gal,)
@@ -50,6 +53,9 @@ class ShapeResult:
     masked_fraction : array, shape (n_gal,), optional
         Part of the stamp's pixels that is missing, of galaxies without a shape too. 0 if
         not given.
+    sky_offset : array, shape (n_gal, 2), optional
+        (u, v) of the centroid from the centre of the stamp, on the sky; None without a
+        Jacobian.
     """
 
     eta: Array
@@ -63,6 +69,7 @@ class ShapeResult:
     n_iter: Array
     status: Array
     masked_fraction: Array = None
+    sky_offset: Array | None = None
 
     def __post_init__(self) -> None:
         if self.masked_fraction is None:
@@ -101,7 +108,10 @@ class ShapeResult:
         """Join results, at least one, in the order given."""
         xp = array_namespace(eta=parts[0].eta)
         return cls(
-            **{f.name: xp.concat([getattr(p, f.name) for p in parts], axis=0) for f in fields(cls)}
+            **{
+                name: xp.concat([getattr(part, name) for part in parts], axis=0)
+                for name in parts[0].columns()
+            }
         )
 
     @property
@@ -128,18 +138,30 @@ class ShapeResult:
         """Return the galaxies with the given row numbers (integer array), in that order."""
         xp = array_namespace(eta=self.eta, rows=rows)
         return ShapeResult(
-            **{f.name: xp.take(getattr(self, f.name), rows, axis=0) for f in fields(self)}
+            **{name: xp.take(column, rows, axis=0) for name, column in self.columns().items()}
         )
 
     def to_numpy(self) -> ShapeResult:
         """Return the same result with NumPy arrays, copied to the host."""
-        return ShapeResult(**{f.name: to_numpy(getattr(self, f.name)) for f in fields(self)})
+        return ShapeResult(**{name: to_numpy(column) for name, column in self.columns().items()})
 
-    def to_table(self) -> Table:
+    def columns(self) -> dict[str, Array]:
+        """Return the fields that there are, by name."""
+        named = {f.name: getattr(self, f.name) for f in fields(self)}
+        return {name: column for name, column in named.items() if column is not None}
+
+    def to_table(self, psf_shapes: PsfShapes | None = None) -> Table:
         """Return the result as an `astropy.table.Table`, with units and descriptions.
 
         Vectors are spread over scalar columns (`eta1`, `eta2`, ...), as survey catalogs
-        have them; `e1`, `g1` and their companions are added.
+        have them; `e1`, `g1` and their companions are added, and `u` and `v` where there is
+        a `sky_offset`. They and `size` then have no unit: it is that of the Jacobian.
+
+        Parameters
+        ----------
+        psf_shapes : PsfShapes, optional
+            Of the same galaxies, or one for all: `psf_eta1`, `psf_eta2` and `psf_size` are
+            added.
         """
         from astropy.table import Table
 
@@ -165,8 +187,15 @@ class ShapeResult:
             "status": host.status,
             "masked_fraction": host.masked_fraction,
         }
+        described = dict(COLUMNS)
+        if host.sky_offset is not None:
+            columns["u"], columns["v"] = host.sky_offset[:, 0], host.sky_offset[:, 1]
+            described |= SKY_COLUMNS
+        if psf_shapes is not None:
+            columns |= psf_shapes.columns(self.n_gal)
+            described |= PSF_COLUMNS
         table = Table(columns)
-        for name, (unit, description) in COLUMNS.items():
+        for name, (unit, description) in described.items():
             table[name].unit = unit
             table[name].description = description
         return table
@@ -194,3 +223,17 @@ COLUMNS: dict[str, tuple[str | None, str]] = {
     "masked_fraction": (None, "part of the stamp's pixels that is missing"),
 }
 """Unit and description of every column of `ShapeResult.to_table`."""
+
+SKY_COLUMNS: dict[str, tuple[str | None, str]] = {
+    "size": (None, "sigma of the Gaussian factor of the weight, on the sky"),
+    "u": (None, "offset of the centroid from the centre of the stamp on the sky, along u"),
+    "v": (None, "offset of the centroid from the centre of the stamp on the sky, along v"),
+}
+"""Those that a Jacobian adds or changes; lengths are in its units."""
+
+PSF_COLUMNS: dict[str, tuple[str | None, str]] = {
+    "psf_eta1": (None, "conformal shear of the PSF, pixel response included, component 1"),
+    "psf_eta2": (None, "conformal shear of the PSF, pixel response included, component 2"),
+    "psf_size": (None, "sigma of the weight matched to the PSF, in the unit of size"),
+}
+"""Those of `fdnt_xp.shapes.psf_shapes.PsfShapes`."""
