@@ -151,6 +151,36 @@ def test_bare_shapes_give_the_same():
         shear_from_eta(eta, eta_cov=cov[:5])
 
 
+@pytest.mark.parametrize("weight", ["uniform", "lorentzian"])
+def test_the_orientations_at_hand_are_taken_off(weight):
+    # Pairs at 90 degrees have no mean shape, but their response depends on where they point.
+    rng, g = np.random.default_rng(11), np.array([0.04, -0.02])
+    left = {True: [], False: []}
+    for _ in range(60):
+        size, angle = rng.uniform(0.2, 1.6, 40), rng.uniform(0.0, 2.0 * np.pi, 40)
+        pairs = size[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        eta = add_shears(eta_from_reduced_shear(g[None, :]), np.concatenate([pairs, -pairs]))
+        for orientations, found in left.items():
+            found.append(shear_from_eta(eta, weight, orientations=orientations).g - g)
+    with_them, without = (np.sqrt(np.mean(np.square(left[one]))) for one in (True, False))
+    # What remains is of the next order in g.
+    assert with_them < 0.15 * without
+    for found in left.values():
+        error = np.std(found, axis=0) / np.sqrt(60)
+        assert np.all(np.abs(np.mean(found, axis=0)) < 4.0 * error)
+
+
+def test_the_error_follows_what_is_taken_off():
+    rng, g = np.random.default_rng(12), np.array([0.05, 0.0])
+    estimates = []
+    for _ in range(300):
+        eta = add_shears(eta_from_reduced_shear(g[None, :]), 0.5 * rng.normal(size=(200, 2)))
+        estimates.append(shear_from_eta(eta, "lorentzian"))
+    scatter = np.std([one.g for one in estimates], axis=0)
+    stated = np.sqrt(np.mean([one.g_err**2 for one in estimates], axis=0))
+    np.testing.assert_allclose(stated, scatter, rtol=0.15)  # 300 draws tell it to 4 %
+
+
 # --- errors --------------------------------------------------------------------------
 
 

@@ -2,7 +2,8 @@
 
 B10, appendix: the linear estimate `gamma^ = sum w eta / (2 sum R1)`, whose expectation is
 `g (1 - |g|² sum R3/sum R1)` to third order in the shear g; that is solved for g. R1 and R3
-are those at the observed shapes, for which this relation is written.
+are those at the observed shapes, for which this relation is written. What the orientations
+that a finite sample happens to have do to its response is taken off (docs, "Responsivity").
 """
 
 from __future__ import annotations
@@ -15,8 +16,15 @@ from typing import Final
 from fdnt_xp.arrays import Array, array_namespace, as_floating, count_true, device_of, require_dtype
 from fdnt_xp.errors import FdntTypeError, FdntValueError, FdntWarning, ShapeMismatchError
 from fdnt_xp.shapes.results import ShapeResult
+from fdnt_xp.shear import add_shears, eta_from_reduced_shear
 from fdnt_xp.shears.estimate import ShearEstimate
-from fdnt_xp.shears.responsivity import first_order, has_response, third_order
+from fdnt_xp.shears.ratio import over_response
+from fdnt_xp.shears.responsivity import (
+    along_and_across,
+    first_order,
+    has_response,
+    third_order,
+)
 from fdnt_xp.shears.weights import (
     Function,
     ShapeWeight,
@@ -25,6 +33,8 @@ from fdnt_xp.shears.weights import (
     galaxy_weights,
 )
 
+_PASSES: Final = 2
+"""Of the orientations before the shear: the shear and they depend on each other, weakly."""
 _NEWTON_STEPS: Final = 60
 """Quadratic in all cases but at the very end of the cubic's range, where a bit a step is left."""
 
@@ -36,6 +46,7 @@ def shear_from_shapes(
     galaxy_weight: Array | None = None,
     use_eg: bool = True,
     cubic: bool = True,
+    orientations: bool = True,
 ) -> ShearEstimate:
     """Estimate the reduced shear of a population from the shapes of its galaxies.
 
@@ -57,6 +68,9 @@ def shear_from_shapes(
         Whether to correct for `shapes.eg`.
     cubic : bool
         Whether to correct for the third order in the shear.
+    orientations : bool
+        Whether to take off the noise of the response by the orientations at hand, which
+        pairs of galaxies at 90 degrees do not take away. It has no mean.
 
     Returns
     -------
@@ -99,7 +113,7 @@ def shear_from_shapes(
     sample = _sample(
         shapes.eta, measured, shapes.eg if use_eg else None, shapes.eta_cov, galaxy_weight
     )
-    return _estimate(sample, as_shape_weight(weight), cubic=cubic)
+    return _estimate(sample, as_shape_weight(weight), cubic=cubic, orientations=orientations)
 
 
 def shear_from_eta(
@@ -110,6 +124,7 @@ def shear_from_eta(
     eta_cov: Array | None = None,
     galaxy_weight: Array | None = None,
     cubic: bool = True,
+    orientations: bool = True,
 ) -> ShearEstimate:
     """Estimate the reduced shear from bare shapes, as `shear_from_shapes` does.
 
@@ -117,7 +132,7 @@ def shear_from_eta(
     ----------
     eta : array, shape (n_gal, 2), n_gal >= 2
         Finite conformal shears.
-    weight, galaxy_weight, cubic
+    weight, galaxy_weight, cubic, orientations
         As for `shear_from_shapes`.
     eg : array, shape (n_gal,), optional
         Ellipticity gradients.
@@ -155,7 +170,10 @@ def shear_from_eta(
                 f"eta_cov must have the shape ({eta.shape[0]}, 2, 2), not {tuple(eta_cov.shape)}"
             )
     return _estimate(
-        _sample(eta, finite, eg, eta_cov, galaxy_weight), as_shape_weight(weight), cubic=cubic
+        _sample(eta, finite, eg, eta_cov, galaxy_weight),
+        as_shape_weight(weight),
+        cubic=cubic,
+        orientations=orientations,
     )
 
 
@@ -222,7 +240,9 @@ def _sample(
     )
 
 
-def _estimate(sample: _Sample, weight: ShapeWeight, *, cubic: bool) -> ShearEstimate:
+def _estimate(
+    sample: _Sample, weight: ShapeWeight, *, cubic: bool, orientations: bool
+) -> ShearEstimate:
     eta = sample.eta
     xp = array_namespace(eta=eta)
     abs_eta = xp.sqrt(eta[:, 0] ** 2 + eta[:, 1] ** 2)
@@ -241,13 +261,21 @@ def _estimate(sample: _Sample, weight: ShapeWeight, *, cubic: bool) -> ShearEsti
     slope = float(xp.sum(r3)) / response if cubic else 0.0
     stretch, back = _inversion(linear, slope)
     influence = xp.matmul(influence, back)
+    even = stretch * linear
+    g = even
+    for _ in range(_PASSES if orientations else 0):
+        uneven = _uneven_response(sample, weight, g) / response
+        unit = xp.eye(2, dtype=eta.dtype, device=device_of(eta))
+        g = over_response((unit + xp.sum(uneven, axis=0))[None, :, :], even[None, :])[0, :]
+    if orientations:
+        influence = influence - xp.matmul(uneven, g)
     n = sample.n_used
     noise = None
     if sample.eta_cov is not None:
         by_linear = _by_eta(sample, expansion) / (2.0 * response)
         noise = xp.astype(_noise(xp.matmul(back, by_linear), sample.eta_cov), sample.dtype)
     return ShearEstimate(
-        g=xp.astype(stretch * linear, sample.dtype),
+        g=xp.astype(g, sample.dtype),
         g_err=xp.astype(xp.sqrt(xp.sum(influence**2, axis=0) * (n / (n - 1.0))), sample.dtype),
         n_used=n,
         method="responsivity",
@@ -256,6 +284,26 @@ def _estimate(sample: _Sample, weight: ShapeWeight, *, cubic: bool) -> ShearEsti
         responsivity=response / float(xp.sum(sample.galaxy_weight)),
         cubic=slope if cubic else None,
     )
+
+
+def _uneven_response(sample: _Sample, weight: ShapeWeight, g: Array) -> Array:
+    """Return what orientation does to the response of each galaxy, shape (n_gal, 2, 2).
+
+    A shape responds to shear along it otherwise than to shear across it: its response is
+    `R1 + R4 (cos 4b, sin 4b; sin 4b, -cos 4b)`, R4 half the difference, b its position
+    angle. Taken at the shapes before the shear, the mean of the second part is zero.
+    """
+    xp = array_namespace(eta=sample.eta)
+    lens = xp.broadcast_to(-eta_from_reduced_shear(g)[None, :], sample.eta.shape)
+    eta = add_shears(lens, sample.eta)
+    square = xp.sum(eta**2, axis=-1)
+    abs_eta = xp.sqrt(square)
+    along, across = along_and_across(abs_eta, weight.expand(abs_eta), sample.eg)
+    safe = xp.where(square > 0, square, xp.ones_like(square))
+    fourfold = sample.galaxy_weight * 0.5 * (along - across) / safe
+    cos = fourfold * (eta[:, 0] ** 2 - eta[:, 1] ** 2)
+    sin = fourfold * 2.0 * eta[:, 0] * eta[:, 1]
+    return xp.stack([xp.stack([cos, sin], axis=-1), xp.stack([sin, -cos], axis=-1)], axis=-2)
 
 
 def _by_eta(sample: _Sample, w: WeightExpansion) -> Array:

@@ -93,13 +93,22 @@ def has_response(eg: Array) -> Array:
 
 def first_order(abs_eta: Array, w: WeightExpansion, eg: Array | None) -> Array:
     """Return R1 from a weight that is expanded already; see `R1`."""
+    along, across = along_and_across(abs_eta, w, eg)
+    return 0.5 * (along + across)
+
+
+def along_and_across(abs_eta: Array, w: WeightExpansion, eg: Array | None) -> tuple[Array, Array]:
+    """Return the responses to shear along the shape and at 45 degrees to it, (n_gal,) each.
+
+    `(eta w' + w)/(1 - EG)` and `Y w`: the derivatives of `w eta` by 2g. R1 is their mean.
+    """
     xp = array_namespace(abs_eta=abs_eta)
     along = w.value + abs_eta * w.first
     if eg is not None:
         good = has_response(eg)
         response = 1.0 - xp.where(good, eg, xp.zeros_like(eg))
         along = xp.where(good, along / response, xp.full_like(along, float("nan")))
-    return 0.5 * (along + (1.0 + abs_eta**2 * _excess(abs_eta)) * w.value)
+    return along, (1.0 + abs_eta**2 * _excess(abs_eta)) * w.value
 
 
 def third_order(abs_eta: Array, w: WeightExpansion) -> Array:
