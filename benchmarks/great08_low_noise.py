@@ -77,14 +77,14 @@ def entries(args: argparse.Namespace) -> Iterator[Entry]:
     if "estimators" in args.part:
         yield Entry(
             name="every estimator",
-            simulations=low_noise(64, 50, args.seeds[:1]),
+            simulations=low_noise(64, 30, args.seeds[:1]),
             estimators=tuple(ESTIMATORS),
         )
     if "methods" in args.part:
         for method in METHODS:
             yield Entry(
                 name=f"method {method}",
-                simulations=low_noise(64, 50, args.seeds[:1]),
+                simulations=low_noise(64, 30, args.seeds[:1]),
                 estimators=("responsivity",),
                 method=method,
             )
@@ -189,7 +189,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
     parser.add_argument("--cells", type=int, nargs="+", default=[64, 40], help="of the part cells")
     parser.add_argument("--sets", type=int, help="of each simulation [default: 15, RealNoise 27]")
-    parser.add_argument("--grid", type=int, help="cells on a side [default: 100, 50 or 30 by part]")
+    parser.add_argument("--grid", type=int, help="cells on a side [default: 100, or 30 by part]")
     parser.add_argument("--jobs", type=int, default=1)
     args = parser.parse_args()
     args.part = args.part or list(PARTS)
