@@ -71,8 +71,10 @@ class RangeError(FdntValueError):
         return (type(self), (self.name, self.value, self.minimum, self.maximum))
 
 
-class CatalogError(FdntError, OSError):
+class CatalogError(OSError, FdntError):
     """A file could not be read, understood, or written."""
+
+    # OSError comes first for its `__new__`, by which clusters bring errors home.
 
 
 class MissingExtraError(FdntError, ImportError):

@@ -48,6 +48,12 @@ def test_every_class_survives_pickling(cls):
     assert copy.__dict__ == error.__dict__
 
 
+@pytest.mark.parametrize("cls", CLASSES)
+def test_every_class_can_be_made_without_its_arguments(cls):
+    # As tblib does, with which Dask sends the errors of its workers.
+    assert type(cls.__new__(cls)) is cls
+
+
 @pytest.mark.parametrize("cls", [cls for cls in CLASSES if cls is not FdntWarning])
 def test_one_except_clause_catches_all(cls):
     with pytest.raises(FdntError):

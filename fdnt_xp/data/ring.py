@@ -321,8 +321,12 @@ class _Rings:
                 chunk_size=self.chunk_size,
             )
         else:
+            # The orientations of a ring are even by its making; the estimators are B10's.
             found = shear_from_shapes(
-                self.shapes_of(ring, start, step), use_eg=name != "raw", cubic=name == "eg+cubic"
+                self.shapes_of(ring, start, step),
+                use_eg=name != "raw",
+                cubic=name == "eg+cubic",
+                orientations=False,
             )
         return np.array([float(found.g[0]), float(found.g[1])])
 
