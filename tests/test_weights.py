@@ -187,7 +187,8 @@ def test_slope_of_the_matched_width_is_its_derivative():
 
 
 def test_the_weight_of_a_stack_is_that_of_its_psfs(xp, dtype, each, to_xp):
-    square, shrink = to_xp([[0.0, 0.1, 0.4, 0.9]], dtype), to_xp([1.2], dtype)
+    # At k = 0 the slope is any finite number: it only ever meets factors of q.
+    square, shrink = to_xp([[0.01, 0.1, 0.4, 0.9]], dtype), to_xp([1.2], dtype)
     inverse = to_xp([5.0], dtype)
     for i, star in enumerate(STARS):
         alone = make_weight(Psf.from_image(to_xp(star, dtype), floor=FLOOR), LARGEST)
