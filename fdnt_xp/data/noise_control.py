@@ -28,7 +28,7 @@ from fdnt_xp.fourier.noise import DeconvolvedNoise, PixelNoise, RoundNoise
 from fdnt_xp.fourier.psf import Psf
 from fdnt_xp.fourier.transform import DeconvolvedStamps, deconvolve
 from fdnt_xp.shapes.job import Job, in_order
-from fdnt_xp.shears.counter_shear import FrozenQuadrupole
+from fdnt_xp.shears.counter_shear import FrozenQuadrupole, moment_covariance
 from fdnt_xp.shears.frames import FrameSample, Gamma
 from fdnt_xp.shears.sample import NoiseOptions, make_sample
 
@@ -148,7 +148,6 @@ class _Moments:
     dq: Real  # (n_gal, 3)
     d: Real  # (n_gal, 2)
     c: Real  # (n_gal, 3, 2)
-    soft: Real  # (n_psf,), n²: the variance of q0
     cov_q: Real  # (n_psf, 3, 3)
     cov_d: Real  # (n_psf, 2, 2)
     cov_c_d: Real  # (n_psf, 3, 2, 2)
@@ -177,8 +176,7 @@ class _Moments:
             dq=_quadrupoles(n2),
             d=n1,
             c=_quadrupoles_by_k(n3),
-            soft=p4[:, 0] + 2.0 * p4[:, 2] + p4[:, 4],
-            cov_q=_covariance(p4),
+            cov_q=moment_covariance(p4),
             cov_d=_matrix(p2),
             cov_c_d=_quadrupoles_by_pairs(p4),
         )
@@ -204,7 +202,7 @@ class _Moments:
         `u_fi = (δ_fi - u_f D_i)/D` and `u_fij = -(u_fi D_j + u_fj D_i + u_f D_ij)/D`.
         """
         q, w = self.q, np.array([bound**2, bound**2, 1.0])
-        D = np.sqrt(np.sum(w * q**2, axis=-1) + softening**2 * self.soft)[:, None]
+        D = np.sqrt(np.sum(w * q**2, axis=-1) + softening**2 * self.cov_q[:, 2, 2])[:, None]
         slope = w * q / D
         curvature = (np.diag(w) - slope[:, :, None] * slope[:, None, :]) / D[:, :, None]
         u, unit = q[:, :2] / D, np.eye(3)[:2]
@@ -222,18 +220,6 @@ def _matrix(m2: Real) -> Real:
 def _quadrupoles(m2: Real) -> Real:
     """Return the moments of `kx² - ky²`, `2 kx ky` and `|k|²` from those of degree 2."""
     return np.stack([m2[:, 0] - m2[:, 2], 2.0 * m2[:, 1], m2[:, 0] + m2[:, 2]], axis=-1)
-
-
-def _covariance(p4: Real) -> Real:
-    """Return the covariance of (q1, q2, q0), (n, 3, 3), from fourth moments of the noise."""
-    xxxx, xxxy, xxyy, xyyy, yyyy = p4.T
-    both, first, second = 2.0 * (xxxy - xyyy), xxxx - yyyy, 2.0 * (xxxy + xyyy)
-    rows = [
-        [xxxx - 2.0 * xxyy + yyyy, both, first],
-        [both, 4.0 * xxyy, second],
-        [first, second, xxxx + 2.0 * xxyy + yyyy],
-    ]
-    return np.moveaxis(np.array(rows), -1, 0)
 
 
 def _quadrupoles_by_k(m3: Real) -> Real:

@@ -235,7 +235,7 @@ class Psf:
             weight=weight.take(table),
             ln_power=xp.take(ln_power, table, axis=0),
             circle_kmax=kmax,
-            largest_kmax=_largest(kmax * longest_stretch(unit)),
+            largest_kmax=_largest(kmax, unit),
             index=index,
             unit_jacobian=unit,
         )
@@ -291,7 +291,7 @@ class Psf:
             self,
             kmax=kmax,
             weight=cubic_table(_ended_smoothly(power, t), zero_beyond=True),
-            largest_kmax=float(xp.max(kmax)) if self.n_psf else self.largest_kmax,
+            largest_kmax=_largest(kmax, self.unit_jacobian),
             floor=max(floor, self.floor),
         )
 
@@ -447,9 +447,10 @@ def _tables(
     return kmax, cubic_table(power, zero_beyond=True), ln_power
 
 
-def _largest(kmax: Array) -> float:
-    """Return the largest radius on the host, that of the whole grid where there is none."""
+def _largest(kmax: Array, unit: Array | None = None) -> float:
+    """Return the largest radius on the k grid, on the host; all of it where there is none."""
     xp = array_namespace(kmax=kmax)
+    kmax = kmax if unit is None else kmax * longest_stretch(unit)
     # In float32 pi is rounded up, past the Nyquist modes.
     return min(float(xp.max(kmax)), np.pi) if int(kmax.shape[0]) else np.pi
 

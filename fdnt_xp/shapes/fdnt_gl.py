@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from fdnt_xp.arrays import Array, array_namespace
+from fdnt_xp.arrays import Array, array_namespace, count_true
 from fdnt_xp.flags import Flag
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.transform import DeconvolvedStamps, mode_phase
@@ -44,7 +44,7 @@ def fit_pixels_of(pixels: Pixels, order: int) -> LaguerreFit:
     # A gap that the larger functions cannot be told apart behind must not pass by smaller ones.
     cut_off = whole & (fit.flags == int(Flag.GL_FAILURE))
     # A host read: how many are to be fitted again decides the size of that batch.
-    n_again = int(xp.sum(xp.astype(cut_off, xp.int32)))
+    n_again = count_true(cut_off)
     if n_again == 0:
         return fit
     place = xp.argsort(xp.astype(~cut_off, xp.int32), stable=True)

@@ -16,6 +16,7 @@ from fdnt_xp.arrays import (
     as_floating,
     device_of,
     require_dtype,
+    rows_of,
     to_numpy,
     works_in_blocks,
 )
@@ -134,12 +135,7 @@ class Job:
 
 def _of_rows(size: Array | None, rows: Rows) -> Array | None:
     """Return the sizes of the given galaxies; one for all stays."""
-    if size is None or int(size.shape[0]) == 1:
-        return size
-    if isinstance(rows, slice):
-        return size[rows]
-    xp = array_namespace(size=size)
-    return xp.take(size, rows, axis=0)
+    return size if size is None or int(size.shape[0]) == 1 else rows_of(size, rows)
 
 
 def in_order(chunks: list[Chunk]) -> Array | None:

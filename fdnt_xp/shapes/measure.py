@@ -15,7 +15,7 @@ from dataclasses import replace
 from types import ModuleType
 from typing import Final, Literal, TypeAlias
 
-from fdnt_xp.arrays import Array, array_namespace, device_of
+from fdnt_xp.arrays import Array, array_namespace, count_true, device_of
 from fdnt_xp.errors import FdntValueError
 from fdnt_xp.flags import Flag
 from fdnt_xp.fourier.grid import KGrid
@@ -236,7 +236,7 @@ def _measure_filled(job: Job, pixels: Pixels, flags: Array, order: int) -> Shape
     xp = array_namespace(flags=flags)
     masked = (flags == 0) & (pixels.masked_fraction() > 0)
     # A host read: how many are to be fitted decides the size of that batch.
-    n_masked = int(xp.sum(xp.astype(masked, xp.int32)))
+    n_masked = count_true(masked)
     place = xp.argsort(xp.astype(~masked, xp.int32), stable=True)
     parts = []
     if n_masked > 0:
@@ -264,7 +264,7 @@ def _measure_source(job: Job, source: Source, pixels: Pixels, flags: Array) -> S
     result, root, finer = _measure_on(few, job.coarse, source, shape, flags, last_step_free=True)
     finer = finer & measurable
     # A host read: how many need the fine grid decides the size of that batch.
-    n_fine = int(xp.sum(xp.astype(finer, xp.int32)))
+    n_fine = count_true(finer)
     if n_fine == 0:
         return result
     order = xp.argsort(xp.astype(~finer, xp.int32), stable=True)

@@ -162,15 +162,15 @@ class FrozenQuadrupole:
         found = root.success & (moments.monopole > 0) & (distance <= self.farthest)
         square, variance = moments.monopole**2, None
         if noise is not None:
-            covariance = MomentNoise.of(grid, window, noise)
-            square = square + self.softening**2 * covariance.monopole
+            covariance = moment_covariance(grid.moments(window**2 * noise.power, 4))
+            covariance = noise.variance[:, None, None] * covariance
+            square = square + self.softening**2 * covariance[:, 2, 2]
         square = square + self.bound**2 * xp.sum(moments.quadrupole**2, axis=-1)
         safe = xp.sqrt(xp.where(found, square, xp.ones_like(square)))
         v = -moments.quadrupole / safe[:, None]
         if noise is not None:
-            variance = _or_zero(
-                covariance.of_ratio(v, moments.monopole / safe, safe, self.bound), found
-            )
+            ratio = moments.monopole / safe
+            variance = _or_zero(ratio_variance(covariance, v, ratio, safe, self.bound), found)
         return FrameValues(
             v=_or_zero(v, found),
             found=found,
@@ -207,7 +207,7 @@ def moments_at(
     """Return the moments at the root of the dipole that is next to `centroid` (pixels)."""
     xp = array_namespace(centroid=centroid)
     re, im = galaxies.shifted(grid, centroid)
-    flux, (xx, xy, yy) = _columns(grid.even_moments(window * re)[:2])
+    flux, xx, xy, yy = _split(grid.moments(window * re, 0, 2))
     (x, y), (xxx, xxy, xyy, yyy) = (_split(m) for m in grid.odd_moments(window * im))
     # d Im/dx0 = kx Re: the Jacobian of the dipole is the matrix of second moments.
     det = xx * yy - xy * xy
@@ -227,66 +227,48 @@ def moments_at(
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class MomentNoise:
-    """Covariances of `q0` and `(q1, q2)` by the noise of the pixels; see `FrozenQuadrupole`.
+def moment_covariance(quartic: Array) -> Array:
+    """Return the covariance of `(q1, q2, q0)` by noise, shape (n, 3, 3); see `FrozenQuadrupole`.
 
     Parameters
     ----------
-    monopole : array, shape (n_gal,)
-        Variance of q0.
-    quadrupole : array, shape (n_gal, 2, 2)
-        Covariance of q1 and q2.
-    cross : array, shape (n_gal, 2)
-        Their covariances with q0.
+    quartic : array, shape (n, 5)
+        Moments of degree 4 of `W² V`, with V the noise power: the covariance of two moments
+        is the moment of the product of their monomials.
     """
+    xp = array_namespace(quartic=quartic)
+    xxxx, xxxy, xxyy, xyyy, yyyy = _split(quartic)
+    both, first, second = 2.0 * (xxxy - xyyy), xxxx - yyyy, 2.0 * (xxxy + xyyy)
+    rows = (
+        (xxxx - 2.0 * xxyy + yyyy, both, first),
+        (both, 4.0 * xxyy, second),
+        (first, second, xxxx + 2.0 * xxyy + yyyy),
+    )
+    return xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
 
-    monopole: Array
-    quadrupole: Array
-    cross: Array
 
-    @classmethod
-    def of(cls, grid: KGrid, window: Array, noise: FrameNoise) -> MomentNoise:
-        """Return the noise under a fixed window: moments of the products of the monomials."""
-        xp = array_namespace(window=window)
-        _, _, quartic = grid.even_moments(window**2 * noise.power)
-        xxxx, xxxy, xxyy, xyyy, yyyy = _split(quartic)
-        both = 2.0 * (xxxy - xyyy)
-        first = xp.stack([xxxx - 2.0 * xxyy + yyyy, both], axis=-1)
-        second = xp.stack([both, 4.0 * xxyy], axis=-1)
-        cross = xp.stack([xxxx - yyyy, 2.0 * (xxxy + xyyy)], axis=-1)
-        return cls(
-            monopole=noise.variance * (xxxx + 2.0 * xxyy + yyyy),
-            quadrupole=noise.variance[:, None, None] * xp.stack([first, second], axis=1),
-            cross=noise.variance[:, None] * cross,
-        )
+def ratio_variance(covariance: Array, v: Array, ratio: Array, norm: Array, bound: float) -> Array:
+    """Return the variance of `v = -q/D`, shape (n_gal, 2); see `FrozenQuadrupole`.
 
-    def of_ratio(self, v: Array, ratio: Array, norm: Array, bound: float) -> Array:
-        """Return the variance of `v = -q/D`, shape (n_gal, 2).
+    To first order `D dv = -(dq - b² v (v.dq) + v (q0/D) dq0)`. What the centroid brings in is
+    of second order for galaxies that look the same upside down, and left out for all.
 
-        To first order `D dv = -(dq - b² v (v.dq) + v (q0/D) dq0)`. What the centroid brings
-        in is of second order for galaxies that look the same upside down, and left out for
-        all.
-
-        Parameters
-        ----------
-        v : array, shape (n_gal, 2)
-        ratio, norm : array, shape (n_gal,)
-            q0/D and D.
-        bound : float
-            b.
-        """
-        xp = array_namespace(v=v)
-        unit = xp.eye(2, dtype=v.dtype, device=device_of(v))
-        by_quadrupole = unit - bound**2 * v[:, :, None] * v[:, None, :]
-        by_monopole = v * ratio[:, None]
-        moved = xp.matmul(by_quadrupole, self.quadrupole + xp.zeros_like(by_quadrupole))
-        spread = xp.sum(moved * by_quadrupole, axis=-1)
-        spread = spread + 2.0 * by_monopole * xp.sum(
-            by_quadrupole * self.cross[:, None, :], axis=-1
-        )
-        spread = spread + by_monopole**2 * self.monopole[:, None]
-        return spread / norm[:, None] ** 2
+    Parameters
+    ----------
+    covariance : array, shape (n_gal, 3, 3)
+        Of (q1, q2, q0).
+    v : array, shape (n_gal, 2)
+    ratio, norm : array, shape (n_gal,)
+        q0/D and D.
+    bound : float
+        b.
+    """
+    xp = array_namespace(v=v)
+    unit = xp.eye(2, dtype=v.dtype, device=device_of(v))
+    by_quadrupole = unit - bound**2 * v[:, :, None] * v[:, None, :]
+    by_moment = xp.concat([by_quadrupole, (v * ratio[:, None])[:, :, None]], axis=-1)
+    spread = xp.sum(xp.matmul(by_moment, covariance) * by_moment, axis=-1)
+    return spread / norm[:, None] ** 2
 
 
 def frame_quantities(
@@ -295,12 +277,12 @@ def frame_quantities(
     """Return what cuts may be made on: see `FrameQuantities`."""
     xp = array_namespace(found=found)
     nan = xp.full_like(moments.flux, float("nan"))
-    point, (xx, _, yy) = _columns(grid.even_moments(xp.broadcast_to(window, window.shape))[:2])
+    point, xx, _, yy = _split(grid.moments(window, 0, 2))
     if noise is None:
         snr = nan
     else:
         # Half of V is in the real part, and each mode of the half plane counts twice.
-        variance = noise.variance * grid.even_moments(window**2 * noise.power)[0][:, 0]
+        variance = noise.variance * grid.moments(window**2 * noise.power, 0)[:, 0]
         snr = moments.flux / xp.sqrt(variance)
     # A Gaussian of size s under a Gaussian window of size w has <k²> = 2/(s² + w²).
     has_size = found & (moments.flux > 0)
@@ -386,11 +368,6 @@ def in_new_frame(solution: Array, old: KGrid, new: KGrid) -> Array:
 def _or_zero(v: Array, found: Array) -> Array:
     xp = array_namespace(v=v)
     return xp.where(found[:, None], v, xp.zeros_like(v))
-
-
-def _columns(moments: tuple[Array, Array]) -> tuple[Array, tuple[Array, ...]]:
-    """Return the moment of degree 0, and those of degree 2 one by one."""
-    return moments[0][:, 0], _split(moments[1])
 
 
 def _split(moments: Array) -> tuple[Array, ...]:
