@@ -6,7 +6,9 @@ import json
 from pathlib import Path
 
 import numpy as np
+from click.testing import CliRunner
 
+from fdnt_xp.app.cli import main
 from fdnt_xp.data.catalog import read_catalog
 from fdnt_xp.data.images import write_image
 from images import galaxies, star
@@ -41,6 +43,14 @@ def set_stamps(number: int) -> np.ndarray:
     n = N_SIDE**2
     stamps = galaxies(rng.uniform(-0.3, 0.3, (n, 2)), (CELL, CELL))
     return (stamps + SIGMA * rng.standard_normal(stamps.shape)).astype(np.float32)
+
+
+def run(*arguments, code: int = 0) -> str:
+    """Run `fdnt-xp great08` and return what it printed, stdout and stderr together."""
+    result = CliRunner().invoke(main, ["great08", *map(str, arguments)])
+    assert result.exit_code == code, result.output
+    assert "Traceback" not in result.output
+    return result.output
 
 
 def same_result(out: Path, reference: Path) -> None:

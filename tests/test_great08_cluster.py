@@ -13,10 +13,8 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
-from challenges import CELL, same_result, write_challenge
-from fdnt_xp.app.cli import main
+from challenges import CELL, run, same_result, write_challenge
 from fdnt_xp.app.great08_measure import MeasureOptions
 from fdnt_xp.app.great08_run import measure_challenge
 from fdnt_xp.app.workers import Failure, open_workers
@@ -56,14 +54,6 @@ def folder(made, tmp_path, monkeypatch):
     shutil.copytree(made / "DIR", tmp_path / "DIR")
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-def run(*arguments, code=0):
-    """Run the command line and return what it printed, stdout and stderr together."""
-    result = CliRunner().invoke(main, ["great08", *map(str, arguments)])
-    assert result.exit_code == code, result.output
-    assert "Traceback" not in result.output
-    return result.output
 
 
 def measure(scheduler: str, code: int = 0) -> str:

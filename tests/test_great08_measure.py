@@ -16,13 +16,11 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
-from click.testing import CliRunner
 
 import fdnt_xp
-from challenges import CELL, N_SIDE, same_result, set_image, set_stamps, write_challenge
+from challenges import CELL, N_SIDE, run, same_result, set_image, set_stamps, write_challenge
 from conftest import selected_backends
 from fdnt_xp.app import great08_run
-from fdnt_xp.app.cli import main
 from fdnt_xp.app.great08_measure import ESTIMATORS, MeasureOptions, SetResult, SetShear
 from fdnt_xp.app.great08_run import measure_challenge
 from fdnt_xp.app.runner import find_noise
@@ -67,14 +65,6 @@ def folder(made, tmp_path, monkeypatch):
     shutil.copytree(made / "DIR", tmp_path / "DIR")
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-def run(*arguments, code=0):
-    """Run the command line and return what it printed, stdout and stderr together."""
-    result = CliRunner().invoke(main, ["great08", *map(str, arguments)])
-    assert result.exit_code == code, result.output
-    assert "Traceback" not in result.output
-    return result.output
 
 
 MEASURE = ("measure", "DIR", "-o", "OUT", "--cell", CELL)

@@ -17,6 +17,12 @@ from fdnt_xp.great08.populations import BRANCHES, Branch
 from fdnt_xp.great08.score import GROUPINGS
 from fdnt_xp.great08.sets import MAX_SHEAR, PSF_KINDS, make_simulation
 
+_SCHEDULER = click.option(
+    "--scheduler",
+    metavar="ADDRESS",
+    help="Let the workers of a Dask cluster do it: tcp://host:8786.",
+)
+
 
 @click.group()
 def great08() -> None:
@@ -67,11 +73,7 @@ def great08() -> None:
     metavar="N",
     help="Sets at a time, each in a process of its own with one thread.",
 )
-@click.option(
-    "--scheduler",
-    metavar="ADDRESS",
-    help="Let the workers of a Dask cluster measure: tcp://host:8786.",
-)
+@_SCHEDULER
 @click.option("-q", "--quiet", is_flag=True, help="No progress bar and no summary.")
 @WHERE
 def measure(
@@ -158,11 +160,7 @@ def measure(
     help="Pixels of the star per pixel of the galaxies, along one axis.",
 )
 @click.option("--jobs", type=int, default=1, show_default=True, help="Processes.")
-@click.option(
-    "--scheduler",
-    metavar="ADDRESS",
-    help="Let the workers of a Dask cluster draw: tcp://host:8786.",
-)
+@_SCHEDULER
 @click.option("-o", "--output", required=True, metavar="DIR", help="Folder to make or to go on in.")
 @click.option("-q", "--quiet", is_flag=True, help="No progress bar and no report.")
 def simulate(

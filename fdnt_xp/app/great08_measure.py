@@ -215,7 +215,7 @@ def measure_set(one: ChallengeSet, options: MeasureOptions) -> tuple[Table, SetR
             backend=backend,
             method=shape_method(options.method),
             noise_variance=noise.variance,
-            oversampling=oversampling,  # type: ignore[arg-type]
+            oversampling=oversampling,
             chunk=options.chunk,
         )
         table.meta = _facts(one, options, backend, noise, oversampling)

@@ -149,7 +149,7 @@ def measure_source(
     noise_variance: float | None,
     ivar: IvarSource | None = None,
     method: ShapeMethod = measure_shapes,
-    oversampling: int = 1,
+    oversampling: float = 1,
     size: float | None = None,
     chunk: int | None = None,
     quiet: bool = True,
@@ -170,7 +170,7 @@ def measure_source(
         Inverse variance of each pixel.
     method : callable
         One of `fdnt_xp.shapes.methods`.
-    oversampling : int
+    oversampling : float
         PSF pixels per image pixel.
     size : float, optional
         Weight size in pixels, if it is not to be solved for.
@@ -210,7 +210,7 @@ class ChunkPsfs:
         The PSF of all, or of each galaxy.
     backend : Backend
         Where to compute.
-    oversampling : int
+    oversampling : float
         PSF pixels per image pixel.
     common : Psf or None
         The one of all, if there is one.
@@ -218,12 +218,12 @@ class ChunkPsfs:
 
     pixels: Pixels
     backend: Backend
-    oversampling: int
+    oversampling: float
     common: Psf | None
 
     @classmethod
     def of(
-        cls, pixels: Pixels, source: StampSource, backend: Backend, oversampling: int
+        cls, pixels: Pixels, source: StampSource, backend: Backend, oversampling: float
     ) -> ChunkPsfs:
         """Return the PSFs of the galaxies of a source.
 

@@ -1,4 +1,4 @@
-"""Tables that others made: positions of galaxies, in any format that astropy reads."""
+"""Tables that others made, in any format that astropy reads: positions of galaxies."""
 
 from __future__ import annotations
 
@@ -54,18 +54,31 @@ def read_positions(
     """
     if origin not in (0, 1):
         raise FdntValueError(f"origin must be 0 or 1, not {origin}")
-    table = _read_any(Path(path))
+    table = read_any(path, "positions")
     xy = [_numbers(table, name, path) for name in (x_column, y_column)]
     name = _find(table, "id")
     ids = np.arange(len(table)) if name is None else np.asarray(table[name])
     return Positions(xy=np.stack(xy, axis=-1) - origin, ids=ids)
 
 
-def _read_any(path: Path) -> Table:
-    """Read a table in the format that its name or content shows, else as plain text."""
+def read_any(path: str | os.PathLike[str], what: str) -> Table:
+    """Read a table in the format that its name or content shows, else as plain text.
+
+    Parameters
+    ----------
+    path : path
+    what : str
+        What the table is to the caller, for messages.
+
+    Raises
+    ------
+    CatalogError
+        If there is no such file, or it cannot be read.
+    """
+    path = Path(path)
     if not path.is_file():
         problem = "is a folder" if path.is_dir() else "does not exist"
-        raise CatalogError(f"cannot read the positions: {path} {problem}")
+        raise CatalogError(f"cannot read the {what}: {path} {problem}")
     if path.suffix.lower() == ".parquet":
         return read_catalog(path)
     with warnings.catch_warnings():
@@ -78,7 +91,7 @@ def _read_any(path: Path) -> Table:
         except Exception as error:
             # Whatever a reader chokes on, the user's news is which file it was.
             reason = str(error).strip().partition("\n")[0] or type(error).__name__
-            raise CatalogError(f"cannot read the positions {path}: {reason}") from error
+            raise CatalogError(f"cannot read the {what} {path}: {reason}") from error
 
 
 def _find(table: Table, name: str) -> str | None:

@@ -8,16 +8,14 @@ The columns are `set` (number or name of the set), `g1`, `g2` (reduced shear) an
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from astropy.table import Table
-from astropy.utils.exceptions import AstropyWarning
 from numpy.typing import NDArray
 
+from fdnt_xp.data.tables import read_any
 from fdnt_xp.errors import CatalogError
 from fdnt_xp.great08.challenge import set_number
 
@@ -29,7 +27,6 @@ COLUMNS: Final[dict[str, str]] = {
     "g2": "reduced shear, component 2",
 }
 _NEEDED: Final = ("set", "g1", "g2")
-_BINARY: Final = (".fit", ".fits")
 
 
 def read_truth(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None = None) -> Table:
@@ -55,7 +52,7 @@ def read_truth(path: str | os.PathLike[str], *, columns: Mapping[str, str] | Non
         If the file cannot be read or lacks a column; if a set or a shear is not a finite
         number, a set occurs twice, or sets of one root shear have different shears.
     """
-    found = _renamed(_read_table(Path(path)), columns or {}, path)
+    found = _renamed(read_any(path, "truth"), columns or {}, path)
     numbers = _set_numbers(found, path)
     g = np.stack([_floats(found, name, path) for name in ("g1", "g2")], axis=-1)
     values, counts = np.unique(numbers, return_counts=True)
@@ -74,22 +71,6 @@ def read_truth(path: str | os.PathLike[str], *, columns: Mapping[str, str] | Non
             table[name] = found[name]
     table.meta.update(found.meta)
     return table[np.argsort(numbers)]
-
-
-def _read_table(path: Path) -> Table:
-    if not path.is_file():
-        problem = "is a folder" if path.is_dir() else "does not exist"
-        raise CatalogError(f"cannot read the truth: {path} {problem}")
-    suffix = path.suffix.lower()
-    formats = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv", **dict.fromkeys(_BINARY, "fits")}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", AstropyWarning)  # odd units and second tables
-        try:
-            return Table.read(path, format=formats.get(suffix, "ascii"))
-        except Exception as error:
-            # Whatever a reader chokes on, the user's news is which file it was.
-            reason = str(error).strip().partition("\n")[0] or type(error).__name__
-            raise CatalogError(f"cannot read the truth {path}: {reason}") from error
 
 
 def _renamed(found: Table, columns: Mapping[str, str], path: str | os.PathLike[str]) -> Table:
