@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 from scipy.special import i0e, j0
 
 from fdnt_xp.errors import FdntTypeError, FdntValueError, RangeError, ShapeMismatchError
-from fdnt_xp.fourier import psf as psf_module
+from fdnt_xp.fourier import circles
 from fdnt_xp.fourier.grid import half_plane_disc
 from fdnt_xp.fourier.psf import Psf
 from images import gaussian_covariance, gaussian_image
@@ -226,7 +226,7 @@ def test_a_psf_that_the_grid_cuts_keeps_its_weight(dtype, to_xp, to_np):
 @pytest.fixture(autouse=True)
 def _two_at_a_time(monkeypatch):
     """Let stacks be worked on in parts."""
-    monkeypatch.setattr(psf_module, "_PSFS_AT_ONCE", 2)
+    monkeypatch.setattr(circles, "_PSFS_AT_ONCE", 2)
 
 
 @pytest.fixture

@@ -222,13 +222,13 @@ def test_many_galaxies_taken_by_their_psf(drawn):
 def test_nearly_equal_pixels_share_tables_and_nothing_else(drawn, monkeypatch):
     _, stars = drawn
     made = []
-    tables = psf_module._tables
+    tables = psf_module.circle_tables
 
     def counted(image, *args):
         made.append(int(image.shape[0]))
         return tables(image, *args)
 
-    monkeypatch.setattr(psf_module, "_tables", counted)
+    monkeypatch.setattr(psf_module, "circle_tables", counted)
     j = JACOBIANS[0] * (1.0 + np.array([[0.0, 2e-5], [-1e-5, 1e-5]]) * np.arange(3)[:, None, None])
     seen = fx.Psf.from_image(stars[0]).through(j)
     assert made == [1, 1]

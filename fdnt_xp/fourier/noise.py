@@ -21,16 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdnt_xp.arrays import Array, Rows, array_namespace, device_of, rows_of
+from fdnt_xp.fourier.circles import CIRCLE_POINTS, CIRCLES, power_on_circles
 from fdnt_xp.fourier.deviates import unit_deviates
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.interpolation import cubic_table
-from fdnt_xp.fourier.psf import (
-    CIRCLE_POINTS,
-    CIRCLES,
-    Psf,
-    power_on_circles,
-    transform_on_modes,
-)
+from fdnt_xp.fourier.psf import Psf, transform_on_modes
 from fdnt_xp.fourier.transform import DeconvolvedStamps, complex_like
 
 _DIRECTIONS: Final = 64

@@ -21,22 +21,14 @@ import numpy as np
 
 from fdnt_xp.arrays import Array, array_namespace, as_floating, device_of, to_numpy
 from fdnt_xp.errors import FdntTypeError, FdntValueError, RangeError, ShapeMismatchError
+from fdnt_xp.fourier.circles import circle_tables, ended_at, pixels_from_middle
 from fdnt_xp.fourier.grid import KGrid
-from fdnt_xp.fourier.interpolation import CubicTable, cubic_table
+from fdnt_xp.fourier.interpolation import CubicTable
 from fdnt_xp.fourier.jacobian import longest_stretch, unit_jacobian, wave_frame
 from fdnt_xp.fourier.transform import complex_like, half_plane_axes, mode_phase
 
-_SCAN_RADII, _SCAN_ANGLES = 48, 12
-"""Circles on which the end of 𝒯 is looked for, and points on half of each."""
-_TABLE_NODES, _TABLE_ANGLES = 97, 24
-"""Nodes of the table of 𝒯. The mean over the angle need not be exact: any isotropic weight
-gives a valid null test. It must be smooth in k, which it is for any number of angles."""
-CIRCLES, CIRCLE_POINTS = 25, 24
-"""Of the table of `|T|²` on circles, and points on half of each."""
 _UNIT_STEPS = 8192.0
 """Of an entry of a unit Jacobian, to one: pixels that differ by less share tables."""
-_PSFS_AT_ONCE = 64
-"""Bounds the memory of the trigonometric sums."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,7 +136,7 @@ class Psf:
         image, usable = _normalised(image)
         if single and not bool(xp.all(usable)):
             raise FdntValueError("image must be finite, with a positive sum, to serve as the PSF")
-        kmax, weight, ln_power = _tables(image, float(oversampling), floor)
+        kmax, weight, ln_power = circle_tables(image, float(oversampling), floor)
         return cls(
             image=image,
             centre=_flux_centroid(image) / oversampling,
@@ -222,7 +214,7 @@ class Psf:
             seen = replace(self, index=None).take(numbers)
         rounded = unit_jacobian(xp.round(unit * _UNIT_STEPS) / _UNIT_STEPS)
         rows, table = _different(numbers, rounded)
-        kmax, weight, ln_power = _tables(
+        kmax, weight, ln_power = circle_tables(
             xp.take(seen.image, rows, axis=0),
             self.oversampling,
             self.floor,
@@ -279,18 +271,11 @@ class Psf:
         Where noise is, the modes beyond carry none of the signal, and leaving them out
         saves their time. A weight that ends before stays as it is.
         """
-        xp = array_namespace(image=self.image)
-        t = xp.linspace(0.0, 1.0, _TABLE_NODES, dtype=self.kmax.dtype, device=device_of(self.kmax))
-        t = t[None, :]
-        row = xp.arange(self.n_psf, dtype=xp.int64, device=device_of(self.kmax))
-        nodes = xp.broadcast_to(t, (self.n_psf, _TABLE_NODES))
-        reached = _first_crossing(t, self.weight.evaluate(nodes, row)[0], floor)
-        power = self.weight.evaluate(nodes * reached[:, None], row)[0]
-        kmax = self.kmax * reached
+        kmax, weight = ended_at(self.kmax, self.weight, floor)
         return replace(
             self,
             kmax=kmax,
-            weight=cubic_table(_ended_smoothly(power, t), zero_beyond=True),
+            weight=weight,
             largest_kmax=_largest(kmax, self.unit_jacobian),
             floor=max(floor, self.floor),
         )
@@ -391,25 +376,19 @@ def _normalised(image: Array) -> tuple[Array, Array]:
     return xp.where(usable[:, None, None], image / safe[:, None, None], point), usable
 
 
-def _positions(n: int, like: Array) -> Array:
-    """Return the coordinates of n pixels from the middle of their array."""
-    xp = array_namespace(like=like)
-    return xp.arange(n, dtype=like.dtype, device=device_of(like)) - 0.5 * (n - 1)
-
-
 def _flux_centroid(image: Array) -> Array:
     """Return (x, y) from the middle of the array, shape (n_psf, 2), for stars of unit flux."""
     xp = array_namespace(image=image)
     ny, nx = image.shape[1:]
-    x = xp.sum(xp.sum(image, axis=1) * _positions(nx, image), axis=-1)
-    y = xp.sum(xp.sum(image, axis=2) * _positions(ny, image), axis=-1)
+    x = xp.sum(xp.sum(image, axis=1) * pixels_from_middle(nx, image), axis=-1)
+    y = xp.sum(xp.sum(image, axis=2) * pixels_from_middle(ny, image), axis=-1)
     return xp.stack([x, y], axis=-1)
 
 
 def _waves(k: Array, n: int, oversampling: float) -> Array:
     """Return `exp(-i k x)`, shape (n_k, n), x in galaxy pixels from the middle of the array."""
     xp = array_namespace(k=k)
-    angle = k[:, None] * (_positions(n, k) / oversampling)[None, :]
+    angle = k[:, None] * (pixels_from_middle(n, k) / oversampling)[None, :]
     return xp.exp(complex_like(angle) * -1j)
 
 
@@ -424,141 +403,9 @@ def _different(numbers: Array, matrices: Array) -> tuple[Array, Array]:
     return xp.asarray(first, **like), xp.asarray(which.reshape(-1), **like)
 
 
-def _tables(
-    image: Array, oversampling: float, floor: float, unit: Array | None = None
-) -> tuple[Array, CubicTable, Array]:
-    """Return `kmax`, `𝒯` and `ln |T|²` on circles of stars of unit flux.
-
-    Parameters
-    ----------
-    image : array, shape (n_psf, ny, nx)
-    oversampling, floor : float
-    unit : array, shape (n_psf, 2, 2), optional
-        B, where the circles are those of the sky.
-    """
-    xp = array_namespace(image=image)
-    n_psf = int(image.shape[0])
-    parts = []
-    for start in range(0, max(n_psf, 1), _PSFS_AT_ONCE):
-        rows = slice(start, min(start + _PSFS_AT_ONCE, n_psf))
-        some = None if unit is None else unit[rows, :, :]
-        parts.append(_circularise(image[rows, :, :], oversampling, floor, some))
-    kmax, power, ln_power = (xp.concat(part) for part in zip(*parts, strict=True))
-    return kmax, cubic_table(power, zero_beyond=True), ln_power
-
-
 def _largest(kmax: Array, unit: Array | None = None) -> float:
     """Return the largest radius on the k grid, on the host; all of it where there is none."""
     xp = array_namespace(kmax=kmax)
     kmax = kmax if unit is None else kmax * longest_stretch(unit)
     # In float32 pi is rounded up, past the Nyquist modes.
     return min(float(xp.max(kmax)), np.pi) if int(kmax.shape[0]) else np.pi
-
-
-def _circularise(
-    image: Array, oversampling: float, floor: float, unit: Array | None
-) -> tuple[Array, Array, Array]:
-    """Return `kmax`, shape (n_psf,), `𝒯` at the table's nodes, and `ln |T|²` on circles."""
-    xp = array_namespace(image=image)
-    like = {"dtype": image.dtype, "device": device_of(image)}
-    scan = xp.linspace(0.0, np.pi, _SCAN_RADII, **like)[None, :]
-    if unit is not None:
-        # A circle of the sky is an ellipse on the grid, and must not reach out of that.
-        scan = scan / longest_stretch(unit)[:, None]
-    kmax = _first_crossing(scan, _mean_power(image, scan, _SCAN_ANGLES, oversampling, unit), floor)
-    t = xp.linspace(0.0, 1.0, _TABLE_NODES, **like)[None, :]
-    power = _mean_power(image, kmax[:, None] * t, _TABLE_ANGLES, oversampling, unit)
-    circles = xp.linspace(0.0, 1.0, CIRCLES, **like)[None, :]
-    on_circles = power_on_circles(image, kmax[:, None] * circles, CIRCLE_POINTS, oversampling, unit)
-    # Where a PSF is dark there is no logarithm; the weight ends before.
-    least = xp.full_like(on_circles, float(xp.finfo(image.dtype).smallest_normal))
-    return kmax, _ended_smoothly(power, t), xp.log(xp.maximum(on_circles, least))
-
-
-def _mean_power(
-    image: Array, radii: Array, n_angle: int, oversampling: float, unit: Array | None
-) -> Array:
-    """Return `<|T|^-2>_θ^-1` on circles, shape (n_psf, n_radius)."""
-    xp = array_namespace(image=image)
-    power = power_on_circles(image, radii, n_angle, oversampling, unit)
-    dark = xp.any(power <= 0, axis=-1)
-    inverse = xp.mean(1.0 / xp.where(power > 0, power, xp.ones_like(power)), axis=-1)
-    return xp.where(dark, xp.zeros_like(inverse), 1.0 / inverse)
-
-
-def power_on_circles(
-    image: Array, radii: Array, n_angle: int, oversampling: float, unit: Array | None = None
-) -> Array:
-    """Return `|T|²` of images on circles, shape (n, n_radius, n_angle).
-
-    `|T|` is the same at k and -k, so half a circle is enough; on equidistant points of it
-    means over the angle converge exponentially.
-
-    Parameters
-    ----------
-    image : array, shape (n or 1, ny, nx)
-    radii : array, shape (n or 1, n_radius)
-        rad/pixel of the galaxies.
-    n_angle : int
-        Angles `π (j + ½)/n_angle`.
-    oversampling : float
-        Pixels of `image` per pixel of the galaxies.
-    unit : array, shape (n or 1, 2, 2), optional
-        B, where the circles are those of the sky: `k = Bᵀ k_sky`.
-    """
-    xp = array_namespace(image=image)
-    ny, nx = image.shape[1:]
-    angle = np.pi * (np.arange(n_angle) + 0.5) / n_angle
-    like = {"dtype": image.dtype, "device": device_of(image)}
-    cos, sin = (xp.asarray(f(angle), **like) for f in (np.cos, np.sin))
-    n_radius = int(radii.shape[1])
-    points = (int(radii.shape[0]), n_radius * n_angle, 1)
-    kx = xp.reshape(radii[:, :, None] * cos, points)
-    ky = xp.reshape(radii[:, :, None] * sin, points)
-    if unit is not None:
-        kx, ky = (unit[:, 0:1, j : j + 1] * kx + unit[:, 1:2, j : j + 1] * ky for j in (0, 1))
-    phase_x = kx * (_positions(nx, image) / oversampling)
-    phase_y = ky * (_positions(ny, image) / oversampling)
-    cos_y, sin_y = xp.cos(phase_y), xp.sin(phase_y)
-    rows = xp.matrix_transpose(image)
-    cos_sum = xp.matmul(xp.cos(phase_x), rows)
-    sin_sum = xp.matmul(xp.sin(phase_x), rows)
-    re = xp.sum(cos_sum * cos_y - sin_sum * sin_y, axis=-1)
-    im = xp.sum(cos_sum * sin_y + sin_sum * cos_y, axis=-1)
-    return xp.reshape(re**2 + im**2, (-1, n_radius, n_angle))
-
-
-def _first_crossing(radii: Array, power: Array, floor: float) -> Array:
-    """Return the first radius where `power` falls below `floor`, or the last; (n_psf,)."""
-    xp = array_namespace(power=power)
-    n_psf = int(power.shape[0])
-    radii = xp.broadcast_to(radii, power.shape)
-    # A radius counts as reached until the first crossing; ln P is nearly linear in a cell.
-    above = xp.astype(power >= floor, xp.int64)
-    reached = xp.sum(xp.cumulative_prod(above, axis=1), axis=1)
-    last = int(power.shape[1]) - 1
-    right = xp.minimum(reached, xp.full_like(reached, last))[:, None]
-    left = right - 1
-    tiny = xp.full_like(power, floor * 1e-6)
-    excess = xp.log(xp.maximum(power, tiny) / floor)
-    r0, r1 = (xp.take_along_axis(radii, i, axis=1) for i in (left, right))
-    e0, e1 = (xp.take_along_axis(excess, i, axis=1) for i in (left, right))
-    found = (reached <= last)[:, None]
-    fraction = xp.where(found, e0 / xp.where(found, e0 - e1, xp.ones_like(e0)), xp.ones_like(e0))
-    return xp.reshape(r0 + fraction * (r1 - r0), (n_psf,))
-
-
-def _ended_smoothly(power: Array, t: Array) -> Array:
-    """Return `P (1 - t⁸ P_end/P)²`, t = k/kmax: zero with its derivative at the end.
-
-    For a PSF that falls to the floor this is a function of P, but for the last few per
-    cent of the disc, and as smooth in k as P is: tapers in k, whose higher derivatives
-    jump where they begin, cost up to 30 times more accuracy. For one that the grid cuts
-    while it is still large, the power of t keeps the weight alive inside.
-    """
-    xp = array_namespace(power=power)
-    end = power[:, -1:]
-    positive = power > 0
-    safe = xp.where(positive, power, xp.ones_like(power))
-    excess = xp.where(positive, 1.0 - t**8 * end / safe, xp.zeros_like(power))
-    return power * xp.maximum(excess, xp.zeros_like(power)) ** 2
