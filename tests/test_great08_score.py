@@ -17,7 +17,8 @@ from fdnt_xp.app.great08_score import Scored, plot_scores
 from fdnt_xp.errors import CatalogError, FdntValueError, ShapeMismatchError
 from fdnt_xp.great08.answers import Answers, match_answers, pooled
 from fdnt_xp.great08.great3 import great3_score
-from fdnt_xp.great08.score import fit_line, noise_floor, quality, score_answers
+from fdnt_xp.great08.lines import fit_line
+from fdnt_xp.great08.score import noise_floor, quality, score_answers
 from fdnt_xp.great08.submission import write_submission
 
 SHEARS = np.array([(0.03, 0.01), (-0.02, 0.04), (0.0, -0.03), (0.05, -0.01), (-0.04, 0.0)])

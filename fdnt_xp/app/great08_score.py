@@ -25,7 +25,8 @@ from fdnt_xp.app.summary import format_measured
 from fdnt_xp.errors import CatalogError, FdntValueError
 from fdnt_xp.great08.answers import Answers, Errors, estimators_of, match_answers, pooled
 from fdnt_xp.great08.great3 import DAMPING, Great3Score, great3_score
-from fdnt_xp.great08.score import Floor, Grouping, LineFit, Noise, Score, score_answers
+from fdnt_xp.great08.lines import LineFit
+from fdnt_xp.great08.score import Floor, Grouping, Noise, Score, score_answers
 from fdnt_xp.great08.submission import read_submission
 from fdnt_xp.great08.truth import TRUTH, read_truth
 

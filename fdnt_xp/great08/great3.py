@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from fdnt_xp.errors import FdntValueError, ShapeMismatchError
 from fdnt_xp.great08.answers import Answers, set_names
-from fdnt_xp.great08.score import LineFit, fit_line
+from fdnt_xp.great08.lines import LineFit, fit_line
 
 M_TARGET: Final = 2e-3
 C_TARGET: Final = 2e-4

@@ -17,7 +17,7 @@ from fdnt_xp.errors import RangeError
 from fdnt_xp.flags import FAILED, Flag
 from fdnt_xp.fourier.psf import Psf
 from fdnt_xp.shears.cuts import QUANTITIES
-from fdnt_xp.shears.frames import SampleValues
+from fdnt_xp.shears.frames import FrameSample, SampleValues
 from fdnt_xp.shears.masks import Masked
 from fdnt_xp.shears.sample import NoiseOptions, make_sample
 
@@ -209,7 +209,12 @@ def measure_responses(
         mask=mask,
         masked=masked,
     )
-    xp = array_namespace(stamps=stamps)
+    return _result(sample, step)
+
+
+def _result(sample: FrameSample, step: float) -> ResponseResult:
+    """Look at a sample in the five frames."""
+    xp = array_namespace(stamps=sample.stamps)
     eta = 2.0 * math.atanh(step)
     # To put shear on is to take the opposite shear off.
     frames = ((0.0, 0.0), (-eta, 0.0), (eta, 0.0), (0.0, -eta), (0.0, eta))

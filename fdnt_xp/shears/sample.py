@@ -77,16 +77,7 @@ def make_sample(
     check_options(size=size, padding=padding, chunk_size=chunk_size)
     if not 0.0 < max_shear <= LARGEST_SHEAR:
         raise RangeError("max_shear", max_shear, 0.0, LARGEST_SHEAR)
-    if statistic not in ("frozen", "eta"):
-        raise FdntValueError(f'statistic must be "frozen" or "eta", not {statistic!r}')
-    if weight is not None and statistic == "frozen":
-        raise FdntValueError('weight goes with statistic="eta"; "frozen" is bounded by itself')
-    if not (math.isfinite(softening) and softening >= 0.0):
-        raise RangeError("softening", softening, 0.0, None)
-    if not (math.isfinite(bound) and bound >= 0.0):
-        raise RangeError("bound", bound, 0.0, None)
-    if bound > 0.0 and statistic != "frozen":
-        raise FdntValueError('bound goes with statistic="frozen"; "eta" takes a weight')
+    _check_statistic(statistic, weight, softening=softening, bound=bound)
     sample_noise = _sample_noise(xp, stamps, noise)
     noisy = sample_noise is not None
     seen_by = psf.ending_at(_NOISY_FLOOR) if noisy else psf
@@ -120,6 +111,21 @@ def make_sample(
         # On the image the weight is convolved with something as wide as the PSF.
         mask=SampleMask.of(xp, stamps, mask, masked, math.hypot(frozen_size, job.length)),
     )
+
+
+def _check_statistic(
+    statistic: str, weight: ShapeWeight | None, *, softening: float, bound: float
+) -> None:
+    """Refuse a statistic that there is not, and options that are out of range or another's."""
+    if statistic not in ("frozen", "eta"):
+        raise FdntValueError(f'statistic must be "frozen" or "eta", not {statistic!r}')
+    if weight is not None and statistic == "frozen":
+        raise FdntValueError('weight goes with statistic="eta"; "frozen" is bounded by itself')
+    for name, value in (("softening", softening), ("bound", bound)):
+        if not (math.isfinite(value) and value >= 0.0):
+            raise RangeError(name, value, 0.0, None)
+    if bound > 0.0 and statistic != "frozen":
+        raise FdntValueError('bound goes with statistic="frozen"; "eta" takes a weight')
 
 
 def default_size(psf: Psf) -> float:
