@@ -23,11 +23,15 @@ from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import numpy as np
+
 import fdnt_xp
-from fdnt_xp.app.great08_measure import ESTIMATORS, MeasureOptions
+from fdnt_xp.app.great08_measure import ESTIMATORS, MeasureOptions, shear_from_catalog
 from fdnt_xp.app.great08_run import MeasureReport, measure_challenge
 from fdnt_xp.app.great08_simulate import run_simulate
 from fdnt_xp.app.numbers import write_json
+from fdnt_xp.data.catalog import read_catalog
+from fdnt_xp.data.simulate import NOISE_SIGMA, great08_image
 from fdnt_xp.great08.answers import Answers, match_answers, pooled
 from fdnt_xp.great08.score import Score, score_answers
 from fdnt_xp.great08.sets import Simulation, make_simulation
@@ -46,7 +50,7 @@ METHODS = (
     "exponential",
     "devaucouleurs",
 )
-PARTS = ("cells", "estimators", "methods", "real-noise")
+PARTS = ("cells", "estimators", "methods", "real-noise", "truncation", "responsivity")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,42 +65,45 @@ class Entry:
 
 def entries(args: argparse.Namespace) -> Iterator[Entry]:
     """Yield what there is to do."""
-    sets = {} if args.sets is None else {"n_sets": args.sets}
-
-    def low_noise(cell: int, grid: int, seeds: list[int]) -> tuple[Simulation, ...]:
-        size = {"cell": cell, "grid": args.grid or grid}
-        return tuple(make_simulation("low-noise", seed=seed, **size, **sets) for seed in seeds)
-
     if "cells" in args.part:
         for cell in args.cells:
             yield Entry(
                 name=f"cells of {cell}",
-                simulations=low_noise(cell, 100, args.seeds),
+                simulations=low_noise(args, cell, 100, args.seeds),
                 estimators=("null", "responsivity"),
             )
     if "estimators" in args.part:
         yield Entry(
             name="every estimator",
-            simulations=low_noise(64, 30, args.seeds[:1]),
+            simulations=low_noise(args, 64, 30, args.seeds[:1]),
             estimators=tuple(ESTIMATORS),
         )
     if "methods" in args.part:
         for method in METHODS:
             yield Entry(
                 name=f"method {method}",
-                simulations=low_noise(64, 30, args.seeds[:1]),
+                simulations=low_noise(args, 64, 30, args.seeds[:1]),
                 estimators=("responsivity",),
                 method=method,
             )
     if "real-noise" in args.part:
         for snr in (20.0, 10.0):
             size = {"cell": 64, "grid": args.grid or 30, "snr": snr}
-            drawn = make_simulation("real-noise", seed=args.seeds[0], **size, **sets)
+            size["n_sets"] = args.sets
+            drawn = make_simulation("real-noise", seed=args.seeds[0], **size)
             yield Entry(
                 name=f"RealNoise, S/N {snr:g}",
                 simulations=(drawn,),
                 estimators=tuple(ESTIMATORS),
             )
+
+
+def low_noise(
+    args: argparse.Namespace, cell: int, grid: int, seeds: list[int]
+) -> tuple[Simulation, ...]:
+    """Return simulations of LowNoise that differ by their seed."""
+    size = {"cell": cell, "grid": args.grid or grid, "n_sets": args.sets}
+    return tuple(make_simulation("low-noise", seed=seed, **size) for seed in seeds)
 
 
 def folder_of(directory: Path, simulation: Simulation) -> Path:
@@ -105,13 +112,18 @@ def folder_of(directory: Path, simulation: Simulation) -> Path:
     return directory / f"{one.branch}-snr{one.snr:g}-{one.grid}x{one.cell}px-seed{one.seed}"
 
 
+def output_of(folder: Path, method: str, estimators: tuple[str, ...]) -> Path:
+    """Return where what was measured is kept."""
+    return folder.with_name(f"{folder.name}-{method}-{'-'.join(estimators)}")
+
+
 def measured(directory: Path, simulation: Simulation, entry: Entry, jobs: int) -> MeasureReport:
     """Draw and measure a simulation, as far as that is not done."""
     folder = folder_of(directory, simulation)
     for line in run_simulate(str(folder), simulation, jobs=jobs):
         print(" ", line, flush=True)
     options = MeasureOptions(method=entry.method, estimators=entry.estimators)
-    output = folder.with_name(f"{folder.name}-{entry.method}-{'-'.join(entry.estimators)}")
+    output = output_of(folder, entry.method, entry.estimators)
     report = measure_challenge(folder, output, options, jobs=jobs, quiet=False)
     if report.failures:
         raise SystemExit(f"{folder}: {report.failures}")
@@ -168,6 +180,46 @@ def say(what: str, score: Score, used: float) -> None:
     print(f"{what:34} Q {score.q:.0f}, {beside}  {biases} (e-3, e-4)  used {used:.4f}", flush=True)
 
 
+def truncation() -> None:
+    """Print the bias that the edge of the cells makes, on galaxies without noise."""
+    n, g = 30, 0.03
+    for cell in (40, 48, 64, 96):
+        found: dict[str, list[float]] = {"null": [], "responsivity": []}
+        for shear in (g, -g):
+            drawn = great08_image(n_x=n, n_y=n, cell=cell, shear=(shear, 0.0), snr=None, seed=5)
+            stamps = drawn.image.reshape(n, cell, n, cell).transpose(0, 2, 1, 3)
+            stamps = stamps.reshape(n * n, cell, cell)
+            psf = fdnt_xp.Psf.from_image(drawn.psf_image)
+            null = fdnt_xp.population_null(
+                stamps, psf, noise_variance=NOISE_SIGMA**2, isotropise=False
+            )
+            shapes = fdnt_xp.measure_shapes(stamps, psf)
+            found["null"].append(float(null.g[0]))
+            found["responsivity"].append(
+                float(fdnt_xp.shear_from_shapes(shapes, "lorentzian").g[0])
+            )
+        m = {name: (plus - minus) / (2.0 * g) - 1.0 for name, (plus, minus) in found.items()}
+        print(f"cells of {cell}, no noise: " + ", ".join(f"{k} m = {v:+.1e}" for k, v in m.items()))
+
+
+def responsivity(directory: Path, simulations: tuple[Simulation, ...]) -> None:
+    """Print RMS over floor of other responsivities, from the catalogs of the part "cells"."""
+    for weight in ("uniform", "lorentzian"):
+        for orientations in (True, False):
+            squares, floors = [], []
+            for simulation in simulations:
+                folder = folder_of(directory, simulation)
+                truth = read_truth(folder / "truth.ecsv")
+                output = output_of(folder, "fdnt-ft", ("null", "responsivity"))
+                for row in truth:
+                    catalog = read_catalog(output / "catalogs" / f"set{row['set']:04d}.fits")
+                    found = shear_from_catalog(catalog, weight, orientations=orientations)
+                    squares.append((found.g - np.array([row["g1"], row["g2"]])) ** 2)
+                    floors.append(found.g_err_noise**2)
+            ratio = np.sqrt(np.mean(squares) / np.mean(floors))
+            print(f"responsivity, {weight}, orientations={orientations}: RMS/floor {ratio:.2f}")
+
+
 def versions() -> dict[str, str]:
     """Return what made the numbers."""
     names = ("numpy", "scipy", "galsim", "astropy")
@@ -201,6 +253,10 @@ def main() -> None:
         found = json.loads(path.read_text()) if path.exists() else {}
         found[entry.name] = result(entry, reports)
         write_json(found, str(path), overwrite=True)
+    if "truncation" in args.part:
+        truncation()
+    if "responsivity" in args.part:
+        responsivity(args.directory, low_noise(args, 64, 100, args.seeds))
 
 
 if __name__ == "__main__":

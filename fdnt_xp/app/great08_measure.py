@@ -310,14 +310,19 @@ def _eta_null(sample: _Sample) -> ShearEstimate:
 
 
 def _responsivity(sample: _Sample) -> ShearEstimate:
-    good = sample.catalog[measured_rows(sample.catalog)]
+    # A galaxy that is lost leaves its partner at 90 degrees alone, and the most elongated are
+    # lost first: without a bound they are most of the error.
+    return shear_from_catalog(sample.catalog, "lorentzian")
+
+
+def shear_from_catalog(catalog: Table, weight: str, **options: Any) -> ShearEstimate:
+    """Return the shear of the shapes in a catalog; see `shear_from_eta` for the options."""
+    good = catalog[measured_rows(catalog)]
     eta = np.stack([np.asarray(good["eta1"]), np.asarray(good["eta2"])], axis=-1)
     cross = np.asarray(good["eta12_cov"])
     rows = [[good["eta1_var"], cross], [cross, good["eta2_var"]]]
     eta_cov = np.moveaxis(np.array(rows, dtype=np.float64), -1, 0)
-    # A galaxy that is lost leaves its partner at 90 degrees alone, and the most elongated are
-    # lost first: without a bound they are most of the error.
-    return shear_from_eta(eta, "lorentzian", eg=np.asarray(good["eg"]), eta_cov=eta_cov)
+    return shear_from_eta(eta, weight, eg=np.asarray(good["eg"]), eta_cov=eta_cov, **options)
 
 
 def _stack(sample: _Sample) -> ShearEstimate:
