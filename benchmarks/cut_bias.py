@@ -1,7 +1,7 @@
 """Bias of cuts, of responses, and of a noise power that is wrong: figures of docs/noise.md.
 
 python benchmarks/cut_bias.py            # all, half an hour
-python benchmarks/cut_bias.py power      # or: cuts, responses, power
+python benchmarks/cut_bias.py power      # or: cuts, responses, sizes, power
 """
 
 from __future__ import annotations
@@ -55,6 +55,22 @@ def responses() -> None:
     say("responses", bias)
 
 
+def sizes() -> None:
+    """Error of the shear of one large galaxy at S/N 15, by size and bound of the null's weight."""
+    versions = draw_versions(Population(radius=2.3, psf_e=0.02, shear=0.02, n_gal=1024, seed=4))
+    clean = versions.stamps[:, :, 0].reshape(-1, *versions.stamps.shape[-2:])
+    sigma = np.sqrt(np.mean(np.sum(versions.stamps**2, axis=(-2, -1)))) / 15.0
+    stamps = np.concatenate([clean] * 3)
+    stamps = stamps + sigma * np.random.default_rng(1).standard_normal(stamps.shape)
+    psf = fx.Psf.from_image(versions.psf_images[0])
+    for size, bound in ((None, 0.0), (2.0, 0.0), (2.0, 3.0)):
+        null = fx.population_null(stamps, psf, noise_variance=sigma**2, size=size, bound=bound)
+        error = np.sqrt(len(stamps) * np.mean(null.g_err**2))
+        print(f"null, size={size}, bound={bound:g}: sigma_g = {error:.4f}")
+    (bias,) = noise_bias(versions, 15.0, ["hsm"], n_stamps=16_384, batch=1024, seed=5)
+    print(f"REGAUSS over its 1 + m: sigma_g = {bias.sigma_g / (1.0 + bias.m):.4f}")
+
+
 def power() -> None:
     """The null at S/N 15, told of a noise power that is wrong by some factor."""
     versions = draw_versions(Population(radius=2.3, psf_e=0.1, shear=0.05, n_gal=1024, seed=31))
@@ -74,5 +90,6 @@ def told(versions: Versions, factor: float) -> NoiseBias:
 
 
 if __name__ == "__main__":
-    for part in sys.argv[1:] or ("cuts", "responses", "power"):
-        {"cuts": cuts, "responses": responses, "power": power}[part]()
+    parts = {"cuts": cuts, "responses": responses, "sizes": sizes, "power": power}
+    for part in sys.argv[1:] or parts:
+        parts[part]()
