@@ -67,10 +67,15 @@ def dtype(request: pytest.FixtureRequest) -> str:
     return request.param
 
 
-@pytest.fixture(params=["numpy", "torch:cpu", "torch:cuda"])
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Choose the libraries: to skip one later is an error, its benchmark being unused."""
+    if "library" in metafunc.fixturenames:
+        cuda = ["torch:cuda"] if metafunc.config.getoption("--cuda") else []
+        metafunc.parametrize("library", ["numpy", "torch:cpu", *cuda], indirect=True)
+
+
+@pytest.fixture
 def library(request: pytest.FixtureRequest, dtype: str) -> Library:
-    if request.param == "torch:cuda" and not request.config.getoption("--cuda"):
-        pytest.skip("asked for with --cuda")
     library = Library(request.param, dtype)
     if library.device == "cpu":
         library.xp.set_num_threads(1)
