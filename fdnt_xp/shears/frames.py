@@ -114,12 +114,11 @@ class FrameSample:
         """Number of galaxies."""
         return int(self.stamps.shape[0])
 
-    def first(self, n_gal: int) -> FrameSample:
-        """Return the first galaxies as a sample of its own."""
-        rows = slice(0, n_gal)
+    def take(self, rows: Rows) -> FrameSample:
+        """Return the given galaxies as a sample of its own."""
         return FrameSample(
-            stamps=self.stamps[rows, :, :],
-            job=self.job.first(n_gal),
+            stamps=rows_of(self.stamps, rows),
+            job=self.job.some(rows),
             statistic=self.statistic,
             reach=self.reach,
             chunk_size=self.chunk_size,

@@ -119,9 +119,10 @@ def population_null(
         `w(|eta|)` that bounds the influence of elongated galaxies; for "eta" alone. Uniform
         by default; where the noise is given, `ShapeWeight.bisquare(1.5)`.
     size : float, optional
-        sigma of the Gaussian part of the weight, pixels. Of the "frozen" weight by default
-        about 1.5 times the size of the PSF, one for the whole sample; for "eta" by default
-        matched to each galaxy, and where the noise is given that of "frozen".
+        sigma of the Gaussian part of the weight, pixels; one for the whole sample. Where the
+        noise is given it is by default that of a typical galaxy of the sample: see
+        `fdnt_xp.shears.sample.default_size`. Without noise it is that of the PSF for "frozen",
+        and matched to each galaxy for "eta".
     softening : float
         Of "frozen": see `FrozenQuadrupole`. 8 weighs a sample of many fluxes better and is
         more sensitive to an error of the noise power.
@@ -223,7 +224,7 @@ class _Null:
         xp = array_namespace(stamps=sample.stamps)
         origin = (0.0, 0.0)
         if sample.n_gal >= 4 * _PILOT:
-            pilot = replace(self, sample=sample.first(_PILOT))
+            pilot = replace(self, sample=sample.take(slice(0, _PILOT)))
             origin, _, _ = pilot.find(origin)
         gamma, v, response = self.find(origin)
         counted, total = v.counted, v.values.shape[0]

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 FRAMES: Final = ("", "_1p", "_1m", "_2p", "_2m")
 """Suffixes of columns: as seen, and with shear of +h and -h put on along each component."""
+STEP: Final = 0.01
+"""Reduced shear of the frames, unless the caller says otherwise."""
 _LARGEST_STEP: Final = 0.1
 
 
@@ -156,7 +158,7 @@ def measure_responses(
     size: float | None = None,
     softening: float = 1.0,
     bound: float = 0.0,
-    step: float = 0.01,
+    step: float = STEP,
     padding: int = 1,
     chunk_size: int | None = None,
 ) -> ResponseResult:
