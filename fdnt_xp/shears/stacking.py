@@ -88,7 +88,9 @@ def shear_from_stack(
         not depend on the observed shape.
     normalise : bool
         Whether to divide each image by the sum of its pixels, which lensing by a shear does
-        not change (a flux under a weight it does). Without it bright galaxies count more.
+        not change (a flux under a weight it does). Without it bright galaxies count more, and
+        where fluxes depend on how a galaxy looks, as in simulations at one S/N as seen, the
+        stack is biased: by 3 % in GREAT08.
     n_groups : int
         Groups of the jackknife: consecutive stamps, so that pairs stay together.
     padding : int
