@@ -6,7 +6,8 @@ import os
 import re
 import warnings
 import zlib
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from fdnt_xp.data.files import new_file
 from fdnt_xp.data.hdf5 import Hdf5Pixels, is_hdf5, open_hdf5
-from fdnt_xp.errors import CatalogError
+from fdnt_xp.errors import CatalogError, FdntError
 
 Pixels: TypeAlias = NDArray[Any] | Hdf5Pixels
 """Pixels as the file holds them: any number type, either byte order, perhaps on disk still."""
@@ -63,18 +64,32 @@ def read_image(
     if not file.is_file():
         problem = "is a folder" if file.is_dir() else "does not exist"
         raise CatalogError(f"cannot read the {what}: {file} {problem}")
+    with fits_errors(file, what):
+        pixels = _first_image(file, extension, what)
+    return _of_rank(pixels, ndim, f"the {what} {file}")
+
+
+@contextmanager
+def fits_errors(file: Path, what: str) -> Iterator[None]:
+    """Let whatever astropy says of a broken file be one `CatalogError` that names it.
+
+    Parameters
+    ----------
+    file : Path
+    what : str
+        What the file is to the caller, for messages.
+    """
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            pixels = _first_image(file, extension, what)
-        except CatalogError:
+            yield
+        except FdntError:
             raise
         except (*_UNREADABLE, fits.VerifyError) as error:
             reason = _truncation(caught) or re.split(r"\n|\. ", str(error))[0]
             raise CatalogError(f"cannot read the {what} {file}: {reason}") from error
     if reason := _truncation(caught):
         raise CatalogError(f"cannot read the {what} {file}: {reason}")
-    return _of_rank(pixels, ndim, f"the {what} {file}")
 
 
 def native_pixels(pixels: Pixels) -> NDArray[Any]:
