@@ -33,7 +33,7 @@ def main() -> None:
 
 @main.command(cls=Command)
 @click.argument("image")
-@click.option("--psf", required=True, metavar="FITS", help="Image of a star, or a cube of them.")
+@click.option("--psf", required=True, metavar="FILE", help="Image of a star, or a cube of them.")
 @click.option("--cell", type=int, metavar="N", help="The image is a grid of N x N pixel cells.")
 @click.option("--positions", metavar="TABLE", help="Positions of the galaxies on the image.")
 @click.option("--stamp-size", type=int, metavar="N", help="Pixels on a side, with --positions.")
@@ -73,15 +73,15 @@ def main() -> None:
 )
 @click.option(
     "--noise-image",
-    metavar="FITS",
+    metavar="FILE",
     help="Blank sky to measure the noise on: an image, or a cube of stamps.",
 )
 @click.option(
-    "--mask", metavar="FITS", help="Of the shape of IMAGE: not 0 where a pixel is missing."
+    "--mask", metavar="FILE", help="Of the shape of IMAGE: not 0 where a pixel is missing."
 )
 @click.option(
     "--weight",
-    metavar="FITS",
+    metavar="FILE",
     help="Of the shape of IMAGE: the inverse variance of each pixel, 0 where it is missing.",
 )
 @HOW
@@ -104,9 +104,9 @@ def measure(
 ) -> None:
     """Measure the galaxies of IMAGE and write a catalog.
 
-    IMAGE is a FITS image that is a grid of cells (--cell), a FITS image with a table of
-    positions (--positions, --stamp-size), or a FITS cube of stamps. FILE.fits[EXT] names an
-    extension.
+    IMAGE is an image that is a grid of cells (--cell), an image with a table of positions
+    (--positions, --stamp-size), or a cube of stamps: FITS or HDF5. FILE.fits[EXT] names an
+    extension, FILE.h5::DATASET a dataset.
     """
     inputs = Inputs(
         image=image,

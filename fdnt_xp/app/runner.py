@@ -288,7 +288,7 @@ def measure_chunks(
     return _stack(tables)
 
 
-def _blank_stamps(blank: Pixels, shape: tuple[int, int]) -> Pixels:
+def _blank_stamps(blank: Pixels, shape: tuple[int, int]) -> NDArray[Any]:
     """Return stamps of a blank image, or the planes of a cube, in memory."""
     if blank.ndim == 2:
         return noise_stamps(native_pixels(blank), shape)

@@ -1,4 +1,4 @@
-"""Images from FITS files, mapped into memory where the file allows it."""
+"""Images from FITS and HDF5 files, left on disk where the file allows it."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ from astropy.utils.exceptions import AstropyWarning
 from numpy.typing import NDArray
 
 from fdnt_xp.data.files import new_file
+from fdnt_xp.data.hdf5 import Hdf5Pixels, is_hdf5, open_hdf5
 from fdnt_xp.errors import CatalogError
 
-Pixels: TypeAlias = "NDArray[Any]"
+Pixels: TypeAlias = NDArray[Any] | Hdf5Pixels
 """Pixels as the file holds them: any number type, either byte order, perhaps on disk still."""
 
 _SHAPES = {2: "an image (ny, nx)", 3: "a cube (n, ny, nx)"}
@@ -29,13 +30,14 @@ _UNREADABLE = (OSError, EOFError, ValueError, TypeError, KeyError, IndexError, z
 def read_image(
     path: str | os.PathLike[str], *, ndim: Collection[int] = (2,), what: str = "image"
 ) -> Pixels:
-    """Read the pixels of a FITS file, without loading them if they can be mapped.
+    """Open the pixels of a FITS or HDF5 file, without loading them if they can stay there.
 
     Parameters
     ----------
     path : path
-        The file; the first image in it is taken, or that of a named or numbered extension,
-        `file.fits[SCI]` or `file.fits[2]`.
+        The file. Of FITS the first image is taken, or that of a named or numbered extension,
+        `file.fits[SCI]` or `file.fits[2]`; of HDF5 (`.h5`, `.hdf5`) the only dataset, or the
+        one that is named, `file.h5::dataset`.
     ndim : collection of int
         Which ranks will do: 2 for an image, 3 for a cube.
     what : str
@@ -44,14 +46,19 @@ def read_image(
     Returns
     -------
     array, shape (ny, nx) or (n, ny, nx)
-        As in the file; `native_pixels` makes numbers for computing of it, or of a part.
+        As in the file, read where it is indexed; `native_pixels` makes numbers for computing
+        of it, or of a part.
 
     Raises
     ------
     CatalogError
-        If there is no such file, it is truncated or not FITS, it has no image, or the image
-        has another rank.
+        If there is no such file, it is truncated or not what its name says, it has no such
+        image, or the image has another rank.
+    MissingExtraError
+        For HDF5 without h5py.
     """
+    if is_hdf5(path):
+        return _of_rank(open_hdf5(path, what=what), ndim, f"the {what} {os.fspath(path)}")
     file, extension = _split(path)
     if not file.is_file():
         problem = "is a folder" if file.is_dir() else "does not exist"
@@ -67,15 +74,10 @@ def read_image(
             raise CatalogError(f"cannot read the {what} {file}: {reason}") from error
     if reason := _truncation(caught):
         raise CatalogError(f"cannot read the {what} {file}: {reason}")
-    if pixels.ndim not in ndim:
-        expected = " or ".join(_SHAPES.get(n, f"rank {n}") for n in sorted(ndim))
-        raise CatalogError(
-            f"the {what} {file} has {pixels.ndim} axes, shape {pixels.shape}; expected {expected}"
-        )
-    return pixels
+    return _of_rank(pixels, ndim, f"the {what} {file}")
 
 
-def native_pixels(pixels: Pixels) -> Pixels:
+def native_pixels(pixels: Pixels) -> NDArray[Any]:
     """Return a contiguous floating-point copy in memory, in the machine's byte order.
 
     float32 and float64 keep their precision, everything else becomes float64.
@@ -105,6 +107,15 @@ def write_image(
         hdu.header[keyword.upper()] = value
     with new_file(path, overwrite=overwrite) as temporary:
         hdu.writeto(temporary)
+
+
+def _of_rank(pixels: Pixels, ndim: Collection[int], name: str) -> Pixels:
+    if pixels.ndim not in ndim:
+        expected = " or ".join(_SHAPES.get(n, f"rank {n}") for n in sorted(ndim))
+        raise CatalogError(
+            f"{name} has {pixels.ndim} axes, shape {pixels.shape}; expected {expected}"
+        )
+    return pixels
 
 
 def _split(path: str | os.PathLike[str]) -> tuple[Path, str | int | None]:
