@@ -12,9 +12,18 @@ import fdnt_xp
 
 Value = str | int | float | bool
 
+SCHEMA: Final = 1
+"""Version of the columns: what they are called and mean, and in which units.
+
+It grows when a column goes, or means something else; new columns alone do not change it.
+
+1. The first that is documented.
+"""
+
 COMMENTS: Final[dict[str, str]] = {
     "CREATOR": "program that made this table",
     "FDNTVER": "its version",
+    "SCHEMA": "version of the columns",
     "NUMPYVER": "version of NumPy",
     "DATE": "when it was made (UTC)",
     "METHOD": "shape method, or responses",
@@ -63,6 +72,7 @@ def provenance(**facts: Value | None) -> dict[str, Value]:
     meta: dict[str, Value] = {
         "CREATOR": "fdnt_xp",
         "FDNTVER": fdnt_xp.__version__,
+        "SCHEMA": SCHEMA,
         "NUMPYVER": np.__version__,
         "DATE": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S"),
     }
