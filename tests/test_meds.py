@@ -9,6 +9,7 @@ from meds_files import Cutout, MedsObject, write_meds
 
 import fdnt_xp as fx
 from fdnt_xp.data.meds import MedsOptions, open_meds
+from fdnt_xp.data.meds_index import chunk_ranges, equal_boxes
 from fdnt_xp.errors import CatalogError, FdntValueError, FdntWarning, RangeError
 
 galsim = pytest.importorskip("galsim")
@@ -183,16 +184,18 @@ def test_smaller_stamps_are_made_larger_by_missing_pixels(file):
 
 def test_chunks_are_bounded_and_groups_have_one_size(file):
     with open_meds(file) as meds:
-        index = meds.index
+        pixels, boxes = meds.index.pixels_per_object, meds.index.largest_box
 
-        def ranges(size, pixels):
-            return [(part.start, part.stop) for part in index.chunks(size, pixels)]
+        def ranges(objects, most):
+            parts = chunk_ranges(pixels, most_objects=objects, most_pixels=most)
+            return [(part.start, part.stop) for part in parts]
 
         assert ranges(3, 10**9) == [(0, 3), (3, 4)]
         assert ranges(9, 2 * 64**2) == [(0, 1), (1, 3), (3, 4)]
         assert ranges(9, 1) == [(0, 1), (1, 2), (2, 3), (3, 4)]  # one object is never divided
-        assert [rows.tolist() for rows in index.groups(slice(0, 4))] == [[0, 2, 3], [1]]
-        assert [rows.tolist() for rows in index.groups(slice(2, 3))] == [[2]]
+        assert [rows.tolist() for rows in equal_boxes(boxes, slice(0, 4))] == [[0, 2, 3], [1]]
+        assert [rows.tolist() for rows in equal_boxes(boxes, slice(2, 3))] == [[2]]
+        assert [rows.tolist() for rows in equal_boxes(boxes, slice(0, 0))] == [[]]
         alone = meds.read(np.array([2]))
     assert (alone.n_objects, alone.n_stamps) == (1, 0)
 

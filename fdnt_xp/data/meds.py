@@ -228,7 +228,8 @@ def open_meds(
         problem = "is a folder" if file.is_dir() else "does not exist"
         raise CatalogError(f"cannot read the {_WHAT}: {file} {problem}")
     with fits_errors(file, _WHAT):
-        hdus = fits.open(file, memmap=True)
+        # Not mapped: what has been read of a map stays in memory until another wants it.
+        hdus = fits.open(file, memmap=False)
     with hdus:
         with fits_errors(file, _WHAT):
             meds = _found(file, hdus, options)

@@ -72,36 +72,19 @@ class CutoutIndex:
         """Number of cutouts that are taken, of all objects."""
         return len(self.starts)
 
-    def chunks(self, size: int, pixels: int) -> Iterator[slice]:
-        """Yield ranges of objects: at most `size`, and of at most so many pixels if it is several.
+    @property
+    def pixels_per_object(self) -> NDArray[np.float64]:
+        """Pixels of all cutouts of each object, shape (n_objects,)."""
+        weights = self.boxes.astype(np.float64) ** 2
+        pixels = np.bincount(self.object_index, weights, minlength=self.n_objects)
+        return pixels.astype(np.float64)
 
-        Parameters
-        ----------
-        size : int
-        pixels : int
-            Of all the cutouts of a range together.
-        """
-        weights = np.bincount(self.object_index, self.boxes**2, minlength=self.n_objects)
-        total = np.concatenate([[0.0], np.cumsum(weights)])
-        start = 0
-        while start < self.n_objects:
-            fitting = int(np.searchsorted(total, total[start] + pixels, side="right")) - 1
-            stop = min(max(start + 1, min(start + size, fitting)), self.n_objects)
-            yield slice(start, stop)
-            start = stop
-
-    def groups(self, rows: slice) -> list[NDArray[np.int64]]:
-        """Divide objects by the size of their cutouts, so that no stamp has to be made larger.
-
-        Those without a cutout are put to one of the others. At least one group is returned.
-        """
+    @property
+    def largest_box(self) -> NDArray[np.int64]:
+        """Pixels on a side of the largest cutout of each object, 0 without one."""
         largest = np.zeros(self.n_objects, dtype=np.int64)
         np.maximum.at(largest, self.object_index, self.boxes)
-        boxes = largest[rows]
-        there = boxes[boxes > 0]
-        boxes = np.where(boxes > 0, boxes, there[0] if len(there) else 0)
-        numbers = np.arange(self.n_objects)[rows]
-        return [numbers[boxes == box] for box in np.unique(boxes)] or [numbers]
+        return largest
 
     def of_objects(self, rows: NDArray[np.integer[Any]]) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return the cutouts of some objects, in their order, and which of them each is of."""
@@ -181,6 +164,49 @@ def index_cutouts(
         **{name: values[whole] for name, values in flat.items()},
         n_lost=int(np.sum(~whole)),
     )
+
+
+def chunk_ranges(
+    pixels: NDArray[np.float64], *, most_objects: int, most_pixels: float
+) -> Iterator[slice]:
+    """Yield ranges of objects, none with more objects or pixels than that if it has several.
+
+    Parameters
+    ----------
+    pixels : array, shape (n_objects,)
+        Of each object.
+    most_objects : int
+    most_pixels : float
+    """
+    total = np.concatenate([[0.0], np.cumsum(pixels)])
+    start = 0
+    while start < len(pixels):
+        fitting = int(np.searchsorted(total, total[start] + most_pixels, side="right")) - 1
+        stop = min(max(start + 1, min(start + most_objects, fitting)), len(pixels))
+        yield slice(start, stop)
+        start = stop
+
+
+def equal_boxes(boxes: NDArray[np.int64], rows: slice) -> list[NDArray[np.int64]]:
+    """Divide objects by the size of their cutouts, so that no stamp has to be made larger.
+
+    Parameters
+    ----------
+    boxes : array, shape (n_objects,)
+        Pixels on a side; 0 without a cutout, which fits any size.
+    rows : slice
+        The objects to divide.
+
+    Returns
+    -------
+    list of arrays
+        Numbers of objects; at least one.
+    """
+    largest = boxes[rows]
+    there = largest[largest > 0]
+    largest = np.where(largest > 0, largest, there[0] if len(there) else 0)
+    numbers = np.arange(len(boxes))[rows]
+    return [numbers[largest == box] for box in np.unique(largest)] or [numbers]
 
 
 def _inside(
