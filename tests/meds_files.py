@@ -1,4 +1,4 @@
-"""MEDS files as others write them, by astropy alone, from the page of the format."""
+"""MEDS files as others write them, by astropy alone, of galaxies that GalSim draws."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from astropy.io import fits
+
+galsim = pytest.importorskip("galsim")
 
 _EMPTY = -9999
 
@@ -78,3 +81,53 @@ def write_meds(path: Path, objects: Sequence[MedsObject], **changes: Any) -> Pat
         hdus.append(fits.ImageHDU(flat, name="psf" if name == "psf" else f"{name}_cutouts"))
     fits.HDUList(hdus).writeto(path, overwrite=True)
     return path
+
+
+SCALE = 0.263
+G = np.array([[0.1, 0.0], [-0.2, 0.15], [0.0, 0.0], [0.05, -0.3]])
+WCS = [
+    galsim.JacobianWCS(SCALE, 0.0, 0.0, SCALE),
+    galsim.JacobianWCS(-0.02, SCALE, -0.27, -0.01),
+    galsim.JacobianWCS(-SCALE, 0.03, 0.02, 0.25),
+]
+SIGMA = 1e-5
+
+
+def draw(profile, wcs, box, origin=None):
+    """Return the image of a profile whose centre is at (x, y) on it, 0-based."""
+    offset = np.zeros(2) if origin is None else np.array(origin) - (box - 1) / 2
+    image = profile.drawImage(nx=box, ny=box, wcs=wcs, offset=tuple(offset), method="no_pixel")
+    return image.array.astype("f8")
+
+
+def cutout(row, epoch, box=48):
+    """Return an exposure of galaxy `row`: flux 1, each epoch with a PSF and pixels of its own."""
+    psf = galsim.Gaussian(sigma=1.7 * SCALE).shear(g1=0.05 * epoch, g2=-0.03)
+    galaxy = galsim.Gaussian(sigma=2.0 * SCALE).shear(g1=G[row, 0], g2=G[row, 1])
+    wcs = WCS[epoch]
+    origin = (box / 2 + 0.3 * epoch, box / 2 - 1.2 + 0.4 * row)
+    return Cutout(
+        image=draw(galsim.Convolve(galaxy, psf), wcs, box, origin),
+        psf=draw(psf, wcs, (41, 44, 38)[epoch]),
+        row=origin[1],
+        col=origin[0],
+        jacobian=(wcs.dudy, wcs.dudx, wcs.dvdy, wcs.dvdx),
+        weight=np.full((box, box), SIGMA**-2),
+        bmask=np.zeros((box, box), dtype="i4"),
+        seg=np.full((box, box), 0, dtype="i4"),
+    )
+
+
+def drawn_cutouts():
+    """Return galaxies 0 and 3 with three exposures of 48 pixels, 1 with two of 64; 2 has none."""
+    return {
+        0: [cutout(0, epoch) for epoch in range(3)],
+        1: [cutout(1, epoch, 64) for epoch in range(2)],
+        3: [cutout(3, epoch) for epoch in (1, 0, 2)],
+    }
+
+
+def objects_of(cutouts):
+    return [
+        MedsObject(id=100 + i, number=i + 1, cutouts=list(cutouts.get(i, []))) for i in range(4)
+    ]

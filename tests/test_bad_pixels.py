@@ -7,7 +7,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from astropy.io import fits
-from meds_files import Cutout, MedsObject, write_meds
 
 import fdnt_xp as fx
 from fdnt_xp.data.adapters import exposure_from_galsim, exposures_from_observations
@@ -18,6 +17,7 @@ from fdnt_xp.data.meds import open_meds
 from fdnt_xp.data.stamps import cube_stamps
 from fdnt_xp.flags import Flag
 from images import galaxies, star
+from meds_files import Cutout, MedsObject, write_meds
 
 galsim = pytest.importorskip("galsim")
 h5py = pytest.importorskip("h5py")

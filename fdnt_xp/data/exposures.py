@@ -40,7 +40,7 @@ class Exposure:
     noise_variance : float, optional
         In place of `ivar`: that of every pixel.
     band : int
-        Number of the filter.
+        Number of the filter, from 0.
 
     Raises
     ------
@@ -106,6 +106,7 @@ class ExposureBatch:
     noise_variance : array, shape (n_stamp,), optional
         In place of `ivar`.
     band : array, shape (n_stamp,), int64, optional
+        Number of the filter; without it all are of one.
 
     Raises
     ------
@@ -193,7 +194,7 @@ class ExposureBatch:
             psf_index=psf_index,
             origin=np.array([_origin(one) for one in flat], dtype=dtype).reshape(-1, 2),
             jacobian=np.array([_jacobian(one) for one in flat], dtype=dtype).reshape(-1, 2, 2),
-            band=np.array([one.band for one in flat], dtype=np.int64),
+            band=_bands(flat),
         )
         return replace(batch, **_noise(flat, dtype))
 
@@ -235,56 +236,6 @@ class ExposureBatch:
 
 
 _NOISE = ("ivar", "noise_variance")
-
-
-def join_bands(batches: Sequence[ExposureBatch]) -> ExposureBatch:
-    """Return the stamps of the same objects in several bands as one batch.
-
-    Parameters
-    ----------
-    batches : sequence of ExposureBatch
-        At least one; the band of each is its place in the sequence.
-
-    Raises
-    ------
-    ShapeMismatchError
-        If they are of different objects.
-    FdntValueError
-        If the noise of only some is known, or of none where stamps of several sizes are to be
-        made equal by missing pixels.
-    """
-    first = batches[0]
-    for number, one in enumerate(batches):
-        if not np.array_equal(one.ids, first.ids):
-            raise ShapeMismatchError(f"band {number} is of other objects than band 0")
-    dtype = np.result_type(*(one.stamps for one in batches))
-    order = np.argsort(np.concatenate([one.object_index for one in batches]), kind="stable")
-
-    def joined(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
-        return np.concatenate(parts)[order]
-
-    n_before = np.cumsum([0, *(len(one.stars) for one in batches)])
-    bands = zip(batches, n_before, strict=False)
-    batch = ExposureBatch(
-        ids=first.ids,
-        object_index=joined([one.object_index for one in batches]),
-        stamps=joined(_padded([one.stamps for one in batches], dtype)),
-        stars=np.concatenate(_padded([one.stars for one in batches], dtype)),
-        psf_index=joined([one.psf_index + before for one, before in bands]),
-        origin=joined([one.origin for one in batches]),
-        jacobian=joined([one.jacobian for one in batches]),
-        band=joined([np.full(one.n_stamps, i, dtype=np.int64) for i, one in enumerate(batches)]),
-    )
-    some = [one for one in batches if one.n_stamps] or [first]
-    uneven = len({one.stamps.shape[1:] for one in some}) > 1
-    known = [one.ivar is not None or one.noise_variance is not None for one in some]
-    _check_known(known, uneven)
-    if not any(known):
-        return batch
-    if not uneven and all(one.ivar is None for one in some):
-        variances = [np.zeros(0) if v is None else v for v in (o.noise_variance for o in batches)]
-        return replace(batch, noise_variance=joined(variances).astype(dtype))
-    return replace(batch, ivar=joined(_padded([_inverse(one) for one in batches], dtype)))
 
 
 def pad_to_one_shape(
@@ -335,11 +286,17 @@ def _jacobian(one: Exposure) -> NDArray[Any]:
     return np.eye(2) if one.jacobian is None else np.asarray(one.jacobian)
 
 
+def _bands(flat: Sequence[Exposure]) -> NDArray[np.int64] | None:
+    """Return the band of each stamp, or None if there is but the first."""
+    bands = np.array([one.band for one in flat], dtype=np.int64)
+    return bands if np.any(bands) else None
+
+
 def _noise(flat: Sequence[Exposure], dtype: np.dtype[Any]) -> dict[str, NDArray[Any]]:
     """Return the inverse variances of all stamps, or their variances, or nothing."""
     known = [one.ivar is not None or one.noise_variance is not None for one in flat]
     uneven = len({one.image.shape for one in flat}) > 1
-    _check_known(known, uneven)
+    check_known(known, uneven)
     if not any(known):
         return {}
     if not uneven and all(one.ivar is None for one in flat):
@@ -353,7 +310,7 @@ def _noise(flat: Sequence[Exposure], dtype: np.dtype[Any]) -> dict[str, NDArray[
     return {"ivar": pad_to_one_shape(maps, dtype)}
 
 
-def _check_known(known: Sequence[bool], uneven: bool) -> None:
+def check_known(known: Sequence[bool], uneven: bool) -> None:
     """Refuse noise that is known of some alone, or not known where it is needed."""
     if not any(known) and uneven:
         raise FdntValueError(
@@ -365,21 +322,3 @@ def _check_known(known: Sequence[bool], uneven: bool) -> None:
             f"{known.count(False)} of {len(known)} have neither ivar nor noise_variance; give it "
             "for all or for none"
         )
-
-
-def _padded(cubes: Sequence[NDArray[Any]], dtype: np.dtype[Any]) -> list[NDArray[Any]]:
-    """Return cubes whose planes have one shape, with zeros above and to the right."""
-    ny, nx = np.max([cube.shape[1:] for cube in cubes], axis=0)
-    return [
-        np.pad(cube.astype(dtype), ((0, 0), (0, ny - cube.shape[1]), (0, nx - cube.shape[2])))
-        for cube in cubes
-    ]
-
-
-def _inverse(batch: ExposureBatch) -> NDArray[Any]:
-    """Return the inverse variance of each pixel of a batch of which the noise is known."""
-    if batch.ivar is not None:
-        return batch.ivar
-    if batch.noise_variance is None:  # there are no stamps
-        return np.zeros(batch.stamps.shape)
-    return np.broadcast_to(1.0 / batch.noise_variance[:, None, None], batch.stamps.shape)
