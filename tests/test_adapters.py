@@ -186,8 +186,8 @@ def test_observations_that_are_none():
 # --- batches --------------------------------------------------------------------------------
 
 
-def flat(shape=(4, 5), **more):
-    return Exposure(image=np.ones(shape), star=np.ones((3, 3)), **more)
+def flat(shape=(4, 5), *, star=1.0, **more):
+    return Exposure(image=np.ones(shape), star=np.full((3, 3), star), **more)
 
 
 def test_ragged_lists_become_one_batch():
@@ -197,13 +197,19 @@ def test_ragged_lists_become_one_batch():
         [],
         [
             Exposure(image=np.full((6, 3), 2.0), star=star, ivar=np.full((6, 3), 3.0)),
-            flat((2, 2), ivar=np.zeros((2, 2)), jacobian=[[1, 2], [3, 4]], band=1),
+            Exposure(
+                image=np.ones((2, 2)),
+                star=np.eye(2),
+                ivar=np.zeros((2, 2)),
+                jacobian=[[1, 2], [3, 4]],
+                band=1,
+            ),
         ],
     ]
     batch = ExposureBatch.of(objects)
     assert batch.stamps.shape == batch.ivar.shape == (3, 6, 5)
     assert batch.object_index.tolist() == [0, 2, 2]
-    assert batch.psf_index.tolist() == [0, 0, 1]  # the same array is the same star
+    assert batch.psf_index.tolist() == [0, 0, 1]  # the same pixels are the same star
     np.testing.assert_array_equal(batch.origin, [[1.0, 2.0], [1.0, 2.5], [0.5, 0.5]])
     np.testing.assert_array_equal(batch.jacobian[2], [[1, 2], [3, 4]])
     np.testing.assert_array_equal(np.sum(batch.ivar, axis=(1, 2)), [40.0, 54.0, 0.0])
@@ -255,14 +261,14 @@ def test_batches_that_are_none():
 
 
 def test_bands_of_the_same_objects():
-    g = ExposureBatch.of([[flat(noise_variance=2.0)], [], [flat(noise_variance=4.0)]])
-    r = ExposureBatch.of([[flat((6, 4), ivar=np.full((6, 4), 3.0))] * 2, [], []])
+    g = ExposureBatch.of([[flat(noise_variance=2.0)], [], [flat(noise_variance=4.0, star=2.0)]])
+    r = ExposureBatch.of([[flat((6, 4), ivar=np.full((6, 4), 3.0), star=3.0)] * 2, [], []])
     joined = join_bands([g, r])
     assert joined.object_index.tolist() == [0, 0, 0, 2]
     assert joined.band.tolist() == [0, 1, 1, 0]
     assert joined.stamps.shape == (4, 6, 5)
     np.testing.assert_array_equal(np.sum(joined.ivar, axis=(1, 2)), [10.0, 72.0, 72.0, 5.0])
-    assert joined.psf_index.tolist() == [0, 2, 2, 1]
+    assert joined.stars[joined.psf_index, 0, 0].tolist() == [1.0, 3.0, 3.0, 2.0]
     assert len(joined.stars) == 3
     same = join_bands([g, g])
     assert same.ivar is None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -14,7 +16,6 @@ from meds_files import (
     SCALE,
     SIGMA,
     WCS,
-    Cutout,
     G,
     MedsObject,
     cutout,
@@ -192,12 +193,12 @@ def test_a_box_of_any_size_is_no_catastrophe(file, tmp_path):
 
 
 def test_no_weights(cutouts, tmp_path):
-    plain = [Cutout(**{**vars(c), "weight": None, "bmask": None, "seg": None}) for c in cutouts[0]]
+    plain = [replace(c, weight=None, bmask=None, seg=None) for c in cutouts[0]]
     path = write_meds(tmp_path / "plain.fits", [MedsObject(id=1, cutouts=plain)])
     assert read(path, [0]).ivar is None
     batch = read(path, [0], noise_variance=4.0)
     assert batch.noise_variance.tolist() == [4.0] * 3
-    masked = [Cutout(**{**vars(c), "weight": None}) for c in cutouts[0]]
+    masked = [replace(c, weight=None) for c in cutouts[0]]
     path = write_meds(tmp_path / "masked.fits", [MedsObject(id=1, cutouts=masked)])
     with pytest.raises(FdntValueError, match="has no weight_cutouts, and a mask alone"):
         read(path, [0])
@@ -217,6 +218,10 @@ def test_psfs_that_are_shared_or_given(cutouts, file, tmp_path):
     batch = read(tmp_path / "shared.fits", [0, 3])
     assert batch.psf_index[[0, 3, 4, 5]].tolist() == [batch.psf_index[0]] * 4
     assert len(batch.stars) == 3
+    # Equal ones at different places are one star too.
+    same = [replace(c, psf=cutouts[0][0].psf) for c in cutouts[0]]
+    equal = write_meds(tmp_path / "equal.fits", [MedsObject(id=1, number=1, cutouts=same)])
+    assert len(read(equal, [0]).stars) == 1
     star = np.ones((5, 7))
     given = read(file, star=star)
     np.testing.assert_array_equal(given.stars, star[None])

@@ -28,8 +28,8 @@ class Exposure:
     image : array, shape (ny, nx)
         Background taken off.
     star : array, shape (py, px)
-        Its PSF at this place, pixel response included, of any normalisation. Exposures that
-        are given the same array share its tables.
+        Its PSF at this place, pixel response included, of any normalisation. Exposures with
+        the same pixels here share its tables.
     jacobian : array, shape (2, 2), optional
         `d(u, v)/d(x, y)`; the unit matrix without it.
     origin : (float, float), optional
@@ -185,13 +185,14 @@ class ExposureBatch:
         flat = [one for exposures in objects for one in exposures]
         single = bool(flat) and all(one.image.dtype.name == "float32" for one in flat)
         dtype = np.dtype("float32" if single else "float64")
-        stars, psf_index = _shared(flat, dtype)
+        padded = pad_to_one_shape([one.star for one in flat] or [np.ones((1, 1))], dtype)
+        stars, psf_index = distinct_stars(padded)
         batch = cls(
             ids=names,
             object_index=np.repeat(np.arange(len(objects)), [len(one) for one in objects]),
             stamps=pad_to_one_shape([one.image for one in flat], dtype),
             stars=stars,
-            psf_index=psf_index,
+            psf_index=psf_index[: len(flat)],
             origin=np.array([_origin(one) for one in flat], dtype=dtype).reshape(-1, 2),
             jacobian=np.array([_jacobian(one) for one in flat], dtype=dtype).reshape(-1, 2, 2),
             band=_bands(flat),
@@ -260,21 +261,35 @@ def pad_to_one_shape(
     return padded
 
 
+def distinct_stars(
+    stars: NDArray[np.floating[Any]],
+) -> tuple[NDArray[np.floating[Any]], NDArray[np.int64]]:
+    """Return the different stars of a stack, and which of them each is.
+
+    Parameters
+    ----------
+    stars : array, shape (n, py, px)
+
+    Returns
+    -------
+    stars : array, shape (n_psf, py, px)
+    psf_index : array, shape (n,), int64
+
+    Notes
+    -----
+    To compare the pixels costs next to nothing beside the tables that `Psf` makes of a star.
+    """
+    numbers: dict[bytes, int] = {}
+    index = [numbers.setdefault(star.tobytes(), len(numbers)) for star in stars]
+    _, first = np.unique(index, return_index=True)
+    return stars[first], np.array(index, dtype=np.int64)
+
+
 def _numbers(pixels: Any, name: str) -> NDArray[Any]:
     array = np.asarray(pixels)
     if array.dtype.kind not in "biuf":
         raise FdntTypeError(f"{name} must hold real numbers, but has dtype {array.dtype}")
     return array
-
-
-def _shared(
-    flat: Sequence[Exposure], dtype: np.dtype[Any]
-) -> tuple[NDArray[np.floating[Any]], NDArray[np.int64]]:
-    """Return the different stars, and which each stamp has; a point if there are no stamps."""
-    different = {id(one.star): one.star for one in flat} or {0: np.ones((1, 1))}
-    place = {key: number for number, key in enumerate(different)}
-    index = np.array([place[id(one.star)] for one in flat], dtype=np.int64)
-    return pad_to_one_shape(list(different.values()), dtype), index
 
 
 def _origin(one: Exposure) -> tuple[float, float]:

@@ -23,7 +23,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from fdnt_xp.data.exposures import ExposureBatch
+from fdnt_xp.data.exposures import ExposureBatch, distinct_stars
 from fdnt_xp.data.images import fits_errors
 from fdnt_xp.data.meds_index import CUTOUTS, CutoutIndex, Cutouts, index_cutouts
 from fdnt_xp.errors import CatalogError, FdntValueError, FdntWarning, RangeError
@@ -195,7 +195,8 @@ class MedsFile:
             of_shape = np.all(different[:, 1:] == (rows, columns), axis=1)
             cut = _take(self.pixels["psf"], different[of_shape, 0], int(rows * columns))
             stars[of_shape, :rows, :columns] = cut.reshape(-1, rows, columns)
-        return stars, index.reshape(-1).astype(np.int64)
+        stars, number = distinct_stars(stars)
+        return stars, number[index.reshape(-1)]
 
 
 @contextmanager
