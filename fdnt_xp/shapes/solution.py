@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, replace
+from typing import Final, Protocol
 
 from fdnt_xp.arrays import Array, array_namespace, device_of, has_any
 from fdnt_xp.flags import FAILED, Flag
@@ -21,6 +21,18 @@ _STATUS_FLAGS: Final = {
     Status.RADIUS_TOO_SMALL: Flag.RADIUS_TOO_SMALL,
     Status.NON_FINITE: Flag.NON_FINITE_RESULT,
 }
+
+
+class SolvedTests(Protocol):
+    """What is asked of the tests that were solved; see `NullTests`."""
+
+    @property
+    def length(self) -> float:
+        """L, the unit of centroids."""
+
+    @property
+    def fixed_width(self) -> Array | None:
+        """sigma² where it was given."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +107,7 @@ def describe(
     return describe_with(tests, root, noise, stamp_shape=stamp_shape, flags=flags)
 
 
-def solution_of(tests: NullTests, root: RootResult) -> tuple[Array, Array]:
+def solution_of(tests: SolvedTests, root: RootResult) -> tuple[Array, Array]:
     """Return eta and the centroid, pixels from the centre of the stamp, at the roots."""
     return root.x[:, :2], tests.length * root.x[:, 2:]
 
@@ -124,6 +136,31 @@ def describe_with(
         What is known of each galaxy so far.
     """
     xp = array_namespace(x=root.x)
+    _, centroid = solution_of(tests, root)
+    ny, nx = stamp_shape
+    off_stamp = (xp.abs(centroid[:, 0]) > 0.5 * nx) | (xp.abs(centroid[:, 1]) > 0.5 * ny)
+    result = describe_at_origin(tests, root, noise, off_stamp=off_stamp, flags=flags)
+    middle = xp.asarray(
+        [0.5 * (nx - 1), 0.5 * (ny - 1)], dtype=root.x.dtype, device=device_of(root.x)
+    )
+    return replace(result, centroid=result.centroid + middle)
+
+
+def describe_at_origin(
+    tests: SolvedTests, root: RootResult, noise: SolutionNoise, *, off_stamp: Array, flags: Array
+) -> ShapeResult:
+    """Return the same with centroids from the origin of the tests.
+
+    Parameters
+    ----------
+    tests : SolvedTests
+        Those that were solved: of stamps, or of sums over them.
+    root, noise, flags
+        As `describe_with` has them.
+    off_stamp : array, shape (n_gal,), bool
+        Where the centroid is not on the stamp.
+    """
+    xp = array_namespace(x=root.x)
     eta, centroid = solution_of(tests, root)
     eta_cov, regular = _eta_covariance(tests, root, noise)
     matched = noise.tests.matched
@@ -132,14 +169,11 @@ def describe_with(
     snr = flux / xp.sqrt(xp.where(known, variance, xp.ones_like(variance)))
     snr = xp.where(known, snr, xp.full_like(snr, float("nan")))
 
-    ny, nx = stamp_shape
-    off_x = xp.abs(centroid[:, 0]) > 0.5 * nx
-    off_y = xp.abs(centroid[:, 1]) > 0.5 * ny
     too_elliptical = eta[:, 0] ** 2 + eta[:, 1] ** 2 > _MOST_ELLIPTICAL**2
     reasons = [(flag, root.status == int(status)) for status, flag in _STATUS_FLAGS.items()]
     reasons += [
         (Flag.SINGULAR, root.success & ~regular),
-        (Flag.CENTROID_OFF_STAMP, off_x | off_y),
+        (Flag.CENTROID_OFF_STAMP, off_stamp),
         (Flag.TOO_ELLIPTICAL, root.success & too_elliptical),
         (Flag.NO_SIGNAL, root.success & ~(flux > 0)),
     ]
@@ -150,7 +184,6 @@ def describe_with(
     information = Flag.SIZE_AT_BOUND if tests.fixed_width is None else Flag.SIZE_FIXED
     informed = matched.at_bound if tests.fixed_width is None else measured
     flags = _raised(flags, information, measured & informed)
-    middle = (xp.full_like(flux, 0.5 * (nx - 1)), xp.full_like(flux, 0.5 * (ny - 1)))
 
     def where_measured(values: Array) -> Array:
         """Return the values, NaN where the galaxy has no shape."""
@@ -161,7 +194,7 @@ def describe_with(
         eta=where_measured(eta),
         eg=where_measured(ellipticity_gradient(eta, noise.tests.tests, matched, tests.length)),
         eta_cov=where_measured(eta_cov),
-        centroid=where_measured(centroid + xp.stack(middle, axis=-1)),
+        centroid=where_measured(centroid),
         size=where_measured(xp.sqrt(matched.width)),
         flux=where_measured(flux),
         snr=where_measured(snr),
@@ -172,7 +205,7 @@ def describe_with(
 
 
 def _eta_covariance(
-    tests: NullTests, root: RootResult, noise: SolutionNoise
+    tests: SolvedTests, root: RootResult, noise: SolutionNoise
 ) -> tuple[Array, Array]:
     """Return `J⁻¹ Cov(f) J⁻ᵀ` of eta, and where J is regular.
 
@@ -192,10 +225,10 @@ def _eta_covariance(
     scale = noise.tests.tests.values[:, 4]
     safe = xp.where(scale > 0, scale, xp.ones_like(scale))[:, None, None]
     to_eta = xp.concat([to_eta[:, :, :2], to_eta[:, :, 2:] / tests.length], axis=-1) / safe
-    return _sandwich(to_eta, noise.covariance), regular
+    return sandwich(to_eta, noise.covariance), regular
 
 
-def _sandwich(a: Array, c: Array) -> Array:
+def sandwich(a: Array, c: Array) -> Array:
     """Return `A C Aᵀ` for stacks of small matrices, as sums of products."""
     xp = array_namespace(a=a)
     ac = xp.sum(a[:, :, :, None] * c[:, None, :, :], axis=2)
