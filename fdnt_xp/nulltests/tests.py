@@ -94,6 +94,8 @@ class TestNoise:
     flux, flux_variance : array, shape (n_gal,)
         Amplitude F of the Gaussian galaxy `F exp(-q sigma²/2)` that has the same sum under
         the weight.
+    scale_variance : array, shape (n_gal,)
+        Of t0 at fixed width.
     tests, matched : TestValues, MatchedWidth
         The raw tests and the width of the weight.
     """
@@ -104,6 +106,7 @@ class TestNoise:
     odd: Array
     flux: Array
     flux_variance: Array
+    scale_variance: Array
     tests: TestValues
     matched: MatchedWidth
 
@@ -247,12 +250,13 @@ class NullTests:
         matched = self._matched_width(frame, moments, width)
         tests = self._tests(frame, moments, width.width)
         even = self._with_width_noise(frame, matched, tests.by_width, power)
-        sum_gauss = power.wg[:, 0]
+        sum_gauss, f0 = power.wg[:, 0], frame.forms.forms[0]
         return TestNoise(
             even=_symmetric(even),
             odd=_symmetric(power.ww[:, 1:4]),
             flux=moments.w_re[:, 0] / sum_gauss,
             flux_variance=power.ww[:, 0] / sum_gauss**2,
+            scale_variance=contract(contract(power.ww[:, 4:], f0), f0)[:, 0],
             tests=tests,
             matched=matched,
         )

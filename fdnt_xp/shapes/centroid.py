@@ -12,7 +12,7 @@ from typing import Final
 from fdnt_xp.arrays import Array, Rows, array_namespace, blocks_in_cache, device_of, rows_of
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.transform import DeconvolvedStamps
-from fdnt_xp.nulltests.dogleg import DoglegOptions, find_root
+from fdnt_xp.nulltests.dogleg import DoglegOptions, RootProblem, find_root
 from fdnt_xp.nulltests.scaled import over_scale
 from fdnt_xp.nulltests.weights import Weight
 
@@ -86,9 +86,24 @@ def starting_centroid(
 
     Where no centroid is found within `reach` pixels, the centre of the stamp.
     """
-    xp = array_namespace(weight=weight)
     problem = DipoleTests(grid=grid, galaxies=galaxies, weight=weight, length=length)
-    centre = xp.zeros_like(galaxies.re[:, :2])
+    return find_centroid(problem, galaxies.re[:, :2], length, reach=reach)
+
+
+def find_centroid(problem: RootProblem, like: Array, length: float, *, reach: float) -> Array:
+    """Return where dipoles vanish, or the origin where that is not within `reach`.
+
+    Parameters
+    ----------
+    problem : RootProblem
+        In `(x0/L, y0/L)`.
+    like : array, shape (n_gal, 2)
+        Of the library, dtype and device of the result.
+    length : float
+        L.
+    """
+    xp = array_namespace(like=like)
+    centre = xp.zeros_like(like)
     options = DoglegOptions(ftol=1e-2, max_iter=12, initial_radius=2.0, max_radius=8.0)
     found = length * find_root(problem, centre, options=options).x
     near = xp.abs(found) <= reach

@@ -159,7 +159,7 @@ def measure_shapes(
     seen = psf if sky is None else sky.seen_by(psf)
     fixed = _fixed_size(xp, stamps, size, sky)
     job = prepare(xp, stamps, seen, padding=padding, size=fixed, max_iter=max_iter)
-    n_chunk = chunk_size or _galaxies_at_once(job, pixels, transform, order)
+    n_chunk = chunk_size or galaxies_in_memory(job, pixels, transform, order)
     chunks = job.chunks(n_gal, n_chunk)
     result = ShapeResult.concat(
         [_measure_chunk(job.of(part), pixels.take(part.rows), transform, order) for part in chunks]
@@ -287,7 +287,7 @@ def _measure_on(
     eta, centroid = solution_of(tests, root)
     noise = source.noise(tests, eta, centroid, inverse_transfer)
     if last_step_free:
-        root = looked_at(root, *tests.scaled(eta, noise.tests.tests, noise.tests.matched))
+        root = looked_at(root, *tests.scaled(eta, noise.tests, noise.matched))
     result = describe_with(tests, root, noise, stamp_shape=stamp_shape, flags=flags)
     return result, root, (squeezed(eta, job.weight.frame) > FINE_ABOVE) | ~root.success
 
@@ -303,7 +303,7 @@ def _check_transform(transform: str, order: int, stamps: Array) -> None:
         check_fit_order(order, stamps)
 
 
-def _galaxies_at_once(job: Job, pixels: Pixels, transform: Transform, order: int) -> int:
+def galaxies_in_memory(job: Job, pixels: Pixels, transform: Transform, order: int) -> int:
     """Return how many galaxies fit the memory of a chunk."""
     ny, nx = pixels.stamp_shape
     grid = job.fine if transform == "gl" else job.coarse

@@ -9,7 +9,7 @@ from fdnt_xp.arrays import Array, array_namespace, device_of, has_any
 from fdnt_xp.flags import FAILED, Flag
 from fdnt_xp.nulltests.dogleg import RootResult, Status, newton_step
 from fdnt_xp.nulltests.gradient import ellipticity_gradient
-from fdnt_xp.nulltests.tests import NullTests, TestNoise
+from fdnt_xp.nulltests.tests import MatchedWidth, NullTests, TestNoise, TestValues
 from fdnt_xp.shapes.results import ShapeResult
 
 _MOST_ELLIPTICAL: Final = 4.0
@@ -37,32 +37,37 @@ class SolvedTests(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class SolutionNoise:
-    """The noise of the tests and of the flux at a solution.
+    """The noise of the tests and of the flux at a solution, and what they are there.
 
     Parameters
     ----------
-    tests : TestNoise
-        For its flux, its tests and its weight; its own covariances are not looked at.
+    tests : TestValues
+    matched : MatchedWidth
+    flux : array, shape (n_gal,)
     covariance : array, shape (n_gal, 4, 4)
         Of (t1, t2, tx, ty), the noise of the size of the weight included; NaN if unknown.
     flux_variance : array, shape (n_gal,)
     """
 
-    tests: TestNoise
+    tests: TestValues
+    matched: MatchedWidth
+    flux: Array
     covariance: Array
     flux_variance: Array
 
     @classmethod
-    def of(cls, tests: TestNoise, covariance: Array) -> SolutionNoise:
+    def of(cls, noise: TestNoise, covariance: Array) -> SolutionNoise:
         """Make it of the covariance of (t1, t2, tx, ty, flux), shape (n_gal, 5, 5)."""
         return cls(
-            tests=tests,
+            tests=noise.tests,
+            matched=noise.matched,
+            flux=noise.flux,
             covariance=covariance[:, :4, :4],
             flux_variance=covariance[:, 4, 4],
         )
 
 
-def white_noise(tests: TestNoise, noise_per_mode: Array) -> SolutionNoise:
+def white_noise(noise: TestNoise, noise_per_mode: Array) -> SolutionNoise:
     """Return the noise of the tests where that of the image is white.
 
     Even and odd tests then have none in common.
@@ -72,13 +77,15 @@ def white_noise(tests: TestNoise, noise_per_mode: Array) -> SolutionNoise:
     noise_per_mode : array, shape (n_gal,)
         `n N`: variance of a pixel times the number of pixels of the grid; NaN if unknown.
     """
-    xp = array_namespace(even=tests.even)
-    zero = xp.zeros_like(tests.even)
-    rows = [xp.concat([tests.even, zero], axis=-1), xp.concat([zero, tests.odd], axis=-1)]
+    xp = array_namespace(even=noise.even)
+    zero = xp.zeros_like(noise.even)
+    rows = [xp.concat([noise.even, zero], axis=-1), xp.concat([zero, noise.odd], axis=-1)]
     return SolutionNoise(
-        tests=tests,
+        tests=noise.tests,
+        matched=noise.matched,
+        flux=noise.flux,
         covariance=xp.concat(rows, axis=-2) * noise_per_mode[:, None, None],
-        flux_variance=tests.flux_variance * noise_per_mode,
+        flux_variance=noise.flux_variance * noise_per_mode,
     )
 
 
@@ -163,8 +170,8 @@ def describe_at_origin(
     xp = array_namespace(x=root.x)
     eta, centroid = solution_of(tests, root)
     eta_cov, regular = _eta_covariance(tests, root, noise)
-    matched = noise.tests.matched
-    flux, variance = noise.tests.flux, noise.flux_variance
+    matched = noise.matched
+    flux, variance = noise.flux, noise.flux_variance
     known = variance > 0
     snr = flux / xp.sqrt(xp.where(known, variance, xp.ones_like(variance)))
     snr = xp.where(known, snr, xp.full_like(snr, float("nan")))
@@ -192,7 +199,7 @@ def describe_at_origin(
 
     return ShapeResult(
         eta=where_measured(eta),
-        eg=where_measured(ellipticity_gradient(eta, noise.tests.tests, matched, tests.length)),
+        eg=where_measured(ellipticity_gradient(eta, noise.tests, matched, tests.length)),
         eta_cov=where_measured(eta_cov),
         centroid=where_measured(centroid),
         size=where_measured(xp.sqrt(matched.width)),
@@ -222,7 +229,7 @@ def _eta_covariance(
         regular = regular & solved
     # Rows 0 and 1 of J⁻¹, column by column.
     to_eta = xp.stack(inverse, axis=-1)[:, :2, :]
-    scale = noise.tests.tests.values[:, 4]
+    scale = noise.tests.values[:, 4]
     safe = xp.where(scale > 0, scale, xp.ones_like(scale))[:, None, None]
     to_eta = xp.concat([to_eta[:, :, :2], to_eta[:, :, 2:] / tests.length], axis=-1) / safe
     return sandwich(to_eta, noise.covariance), regular
