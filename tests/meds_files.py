@@ -91,6 +91,7 @@ WCS = [
     galsim.JacobianWCS(-SCALE, 0.03, 0.02, 0.25),
 ]
 SIGMA = 1e-5
+SMALL, LARGE = 40, 48
 
 
 def draw(profile, wcs, box, origin=None):
@@ -100,7 +101,7 @@ def draw(profile, wcs, box, origin=None):
     return image.array.astype("f8")
 
 
-def cutout(row, epoch, box=48):
+def cutout(row, epoch, box=SMALL):
     """Return an exposure of galaxy `row`: flux 1, each epoch with a PSF and pixels of its own."""
     psf = galsim.Gaussian(sigma=1.7 * SCALE).shear(g1=0.05 * epoch, g2=-0.03)
     galaxy = galsim.Gaussian(sigma=2.0 * SCALE).shear(g1=G[row, 0], g2=G[row, 1])
@@ -108,7 +109,7 @@ def cutout(row, epoch, box=48):
     origin = (box / 2 + 0.3 * epoch, box / 2 - 1.2 + 0.4 * row)
     return Cutout(
         image=draw(galsim.Convolve(galaxy, psf), wcs, box, origin),
-        psf=draw(psf, wcs, (41, 44, 38)[epoch]),
+        psf=draw(psf, wcs, (25, 28, 24)[epoch]),
         row=origin[1],
         col=origin[0],
         jacobian=(wcs.dudy, wcs.dudx, wcs.dvdy, wcs.dvdx),
@@ -119,10 +120,10 @@ def cutout(row, epoch, box=48):
 
 
 def drawn_cutouts():
-    """Return galaxies 0 and 3 with three exposures of 48 pixels, 1 with two of 64; 2 has none."""
+    """Return galaxies 0 and 3 with three exposures, 1 with two larger ones; 2 has none."""
     return {
         0: [cutout(0, epoch) for epoch in range(3)],
-        1: [cutout(1, epoch, 64) for epoch in range(2)],
+        1: [cutout(1, epoch, LARGE) for epoch in range(2)],
         3: [cutout(3, epoch) for epoch in (1, 0, 2)],
     }
 

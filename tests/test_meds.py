@@ -13,8 +13,10 @@ from fdnt_xp.data.meds import MedsOptions, open_meds
 from fdnt_xp.data.meds_index import chunk_ranges, equal_boxes
 from fdnt_xp.errors import CatalogError, FdntValueError, FdntWarning, RangeError
 from meds_files import (
+    LARGE,
     SCALE,
     SIGMA,
+    SMALL,
     WCS,
     G,
     MedsObject,
@@ -77,7 +79,7 @@ def test_a_file_that_galsim_wrote(tmp_path):
 
     objects = []
     for row in (1, 3):
-        parts = [cutout(row, epoch) for epoch in (1, 2)]
+        parts = [cutout(row, epoch, 48) for epoch in (1, 2)]
         wcs = [galsim.AffineTransform(w.dudx, w.dudy, w.dvdx, w.dvdy) for w in WCS[1:]]
         objects.append(
             MultiExposureObject(
@@ -137,16 +139,16 @@ def test_which_cutouts(chosen, expected, file, cutouts):
     assert np.bincount(batch.object_index, minlength=4).tolist() == expected
     first = cutouts[3][1 if chosen == "epochs" else 0]
     place = np.flatnonzero(batch.object_index == 3)[0]
-    np.testing.assert_array_equal(batch.stamps[place, :48, :48], first.image)
+    np.testing.assert_array_equal(batch.stamps[place, :SMALL, :SMALL], first.image)
 
 
 def test_smaller_stamps_are_made_larger_by_missing_pixels(file):
     batch = read(file)
-    assert batch.stamps.shape == (8, 64, 64)
+    assert batch.stamps.shape == (8, LARGE, LARGE)
     small = batch.object_index != 1
-    assert np.all(batch.ivar[small, 48:] == 0)
-    assert np.all(batch.ivar[small, :, 48:] == 0)
-    assert np.all(batch.ivar[small, :48, :48] > 0)
+    assert np.all(batch.ivar[small, SMALL:] == 0)
+    assert np.all(batch.ivar[small, :, SMALL:] == 0)
+    assert np.all(batch.ivar[small, :SMALL, :SMALL] > 0)
     assert np.all(batch.ivar[~small] > 0)
 
 
@@ -159,7 +161,7 @@ def test_chunks_are_bounded_and_groups_have_one_size(file):
             return [(part.start, part.stop) for part in parts]
 
         assert ranges(3, 10**9) == [(0, 3), (3, 4)]
-        assert ranges(9, 2 * 64**2) == [(0, 1), (1, 3), (3, 4)]
+        assert ranges(9, 2 * LARGE**2) == [(0, 1), (1, 3), (3, 4)]
         assert ranges(9, 1) == [(0, 1), (1, 2), (2, 3), (3, 4)]  # one object is never divided
         assert [rows.tolist() for rows in equal_boxes(boxes, slice(0, 4))] == [[0, 2, 3], [1]]
         assert [rows.tolist() for rows in equal_boxes(boxes, slice(2, 3))] == [[2]]
@@ -185,7 +187,7 @@ def test_broken_rows_lose_their_cutouts_alone(file, cutouts, tmp_path):
 
 def test_a_box_of_any_size_is_no_catastrophe(file, tmp_path):
     with fits.open(file) as hdus:
-        hdus["object_data"].data["box_size"] = [2**62, -3, 0, 48]
+        hdus["object_data"].data["box_size"] = [2**62, -3, 0, SMALL]
         hdus.writeto(tmp_path / "broken.fits")
     with pytest.warns(FdntWarning, match="5 cutouts"):
         batch = read(tmp_path / "broken.fits")
@@ -231,7 +233,7 @@ def test_psfs_that_are_shared_or_given(cutouts, file, tmp_path):
         [MedsObject(id=1, number=1, cutouts=cutouts[0][:1])],
         psf_row_size=None,
         psf_col_size=None,
-        psf_box_size=np.array([41]),
+        psf_box_size=np.array([25]),
     )
     np.testing.assert_array_equal(read(boxed, [0]).stars[0], cutouts[0][0].psf)
 
