@@ -20,7 +20,8 @@ from fdnt_xp.app import measure as measure_module
 from fdnt_xp.app.backends import load_backend
 from fdnt_xp.app.cli import main
 from fdnt_xp.app.demo import shear_lines
-from fdnt_xp.app.runner import find_noise, measure_source
+from fdnt_xp.app.noise import find_noise
+from fdnt_xp.app.runner import measure_source
 from fdnt_xp.data.catalog import read_catalog, write_catalog
 from fdnt_xp.data.simulate import great08_image
 from fdnt_xp.data.stamps import cube_stamps, grid_stamps

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 
 import fdnt_xp.peers  # noqa: F401  gives its methods their names
 from fdnt_xp.app.backends import Backend, load_backend
+from fdnt_xp.app.noise import Noise, find_noise
 from fdnt_xp.app.responses import measure_source_responses
-from fdnt_xp.app.runner import Noise, find_noise, measure_source
+from fdnt_xp.app.runner import measure_source
 from fdnt_xp.data.images import Pixels, read_image
 from fdnt_xp.data.ivar import IvarSource
 from fdnt_xp.data.provenance import Value, provenance
