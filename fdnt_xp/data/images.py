@@ -16,7 +16,7 @@ from astropy.utils.exceptions import AstropyWarning
 from numpy.typing import NDArray
 
 from fdnt_xp.data.files import new_file
-from fdnt_xp.data.hdf5 import Hdf5Pixels, is_hdf5, open_hdf5
+from fdnt_xp.data.hdf5 import Hdf5Pixels, is_hdf5, open_hdf5, split_name
 from fdnt_xp.errors import CatalogError
 
 Pixels: TypeAlias = NDArray[Any] | Hdf5Pixels
@@ -107,6 +107,11 @@ def write_image(
         hdu.header[keyword.upper()] = value
     with new_file(path, overwrite=overwrite) as temporary:
         hdu.writeto(temporary)
+
+
+def image_file(path: str | os.PathLike[str]) -> Path:
+    """Return the file of a name that `read_image` takes."""
+    return split_name(path)[0] if is_hdf5(path) else _split(path)[0]
 
 
 def _of_rank(pixels: Pixels, ndim: Collection[int], name: str) -> Pixels:
