@@ -301,7 +301,7 @@ def _write_part(table: Table, path: Path) -> None:
 
 def _read_part(path: Path) -> Table:
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             header = get_header_from_yaml(str(stored[_HEADER]).split("\n"))
             table = Table({column["name"]: stored[column["name"]] for column in header["datatype"]})
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
