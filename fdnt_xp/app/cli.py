@@ -12,6 +12,7 @@ import fdnt_xp
 from fdnt_xp.app.check import CheckOptions, run_check
 from fdnt_xp.app.command import HOW, JOBS, OVERWRITE, WHERE, Command
 from fdnt_xp.app.demo import Field, run_demo
+from fdnt_xp.app.exposures_command import measure_exposures_command
 from fdnt_xp.app.gradient_figure import GradientFigure, draw_gradient_figure
 from fdnt_xp.app.great08_commands import great08
 from fdnt_xp.app.measure import Inputs, Settings
@@ -340,6 +341,7 @@ def check(output: str | None, figure: str | None, overwrite: bool, **options: An
 
 
 main.add_command(great08)
+main.add_command(measure_exposures_command)
 
 
 @main.group(name="figure")

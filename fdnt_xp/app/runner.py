@@ -14,6 +14,7 @@ from tqdm import tqdm
 from fdnt_xp.app.backends import Backend
 from fdnt_xp.app.chunks import ChunkSize
 from fdnt_xp.arrays import Array
+from fdnt_xp.data.fits_pixels import let_go
 from fdnt_xp.data.images import Pixels, native_pixels
 from fdnt_xp.data.ivar import IvarSource
 from fdnt_xp.data.stamps import StampChunk, StampSource
@@ -172,6 +173,7 @@ class ChunkPsfs:
 
     def _make(self, pixels: Pixels) -> Psf:
         image = self.backend.from_numpy(native_pixels(pixels))
+        let_go(self.pixels)
         return Psf.from_image(image, oversampling=self.oversampling)
 
 

@@ -6,7 +6,8 @@ import os
 import re
 import warnings
 import zlib
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -15,11 +16,13 @@ from astropy.io import fits
 from astropy.utils.exceptions import AstropyWarning
 from numpy.typing import NDArray
 
+from fdnt_xp.data import fits_pixels
 from fdnt_xp.data.files import new_file
+from fdnt_xp.data.fits_pixels import FitsSections, map_pixels
 from fdnt_xp.data.hdf5 import Hdf5Pixels, is_hdf5, open_hdf5, split_name
-from fdnt_xp.errors import CatalogError
+from fdnt_xp.errors import CatalogError, FdntError
 
-Pixels: TypeAlias = NDArray[Any] | Hdf5Pixels
+Pixels: TypeAlias = NDArray[Any] | Hdf5Pixels | FitsSections
 """Pixels as the file holds them: any number type, either byte order, perhaps on disk still."""
 
 _SHAPES = {2: "an image (ny, nx)", 3: "a cube (n, ny, nx)"}
@@ -63,18 +66,32 @@ def read_image(
     if not file.is_file():
         problem = "is a folder" if file.is_dir() else "does not exist"
         raise CatalogError(f"cannot read the {what}: {file} {problem}")
+    with fits_errors(file, what):
+        pixels = _first_image(file, extension, what)
+    return _of_rank(pixels, ndim, f"the {what} {file}")
+
+
+@contextmanager
+def fits_errors(file: Path, what: str) -> Iterator[None]:
+    """Let whatever astropy says of a broken file be one `CatalogError` that names it.
+
+    Parameters
+    ----------
+    file : Path
+    what : str
+        What the file is to the caller, for messages.
+    """
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            pixels = _first_image(file, extension, what)
-        except CatalogError:
+            yield
+        except FdntError:
             raise
         except (*_UNREADABLE, fits.VerifyError) as error:
             reason = _truncation(caught) or re.split(r"\n|\. ", str(error))[0]
             raise CatalogError(f"cannot read the {what} {file}: {reason}") from error
     if reason := _truncation(caught):
         raise CatalogError(f"cannot read the {what} {file}: {reason}")
-    return _of_rank(pixels, ndim, f"the {what} {file}")
 
 
 def native_pixels(pixels: Pixels) -> NDArray[Any]:
@@ -143,20 +160,26 @@ def _first_image(file: Path, extension: str | int | None, what: str) -> Pixels:
             chosen = [hdus[extension]]
         else:
             chosen = hdus
-        for number, hdu in enumerate(chosen):
+        for hdu in chosen:
             if hdu.is_image and hdu.shape and all(hdu.shape):
-                index = extension if extension is not None else number
                 break
         else:
             raise CatalogError(f"the {what} {file} holds no image")
-        try:
-            return np.asarray(hdu.data)
-        except ValueError as error:
-            if "memory-map" not in str(error):
-                raise
-    # Pixels that are stored scaled (BZERO, BSCALE) have to be computed.
+        index = hdus.index_of(hdu)
+        if not isinstance(hdu, fits.CompImageHDU):
+            try:
+                mapped = map_pixels(file, hdu)
+                return np.asarray(hdu.data) if mapped is None else mapped
+            except ValueError as error:
+                if "memory-map" not in str(error):
+                    raise
+    # Pixels that are packed, or stored scaled (BZERO, BSCALE), have to be computed.
     with fits.open(file, memmap=False) as hdus:
-        return np.asarray(hdus[index].data)
+        hdu = hdus[index]
+        first = np.asarray(hdu.section[:1])
+        if first.nbytes * hdu.shape[0] > fits_pixels.IN_MEMORY:
+            return FitsSections(file=file, number=index, shape=hdu.shape, dtype=first.dtype)
+        return np.asarray(hdu.data)
 
 
 def _truncation(caught: list[warnings.WarningMessage]) -> str | None:

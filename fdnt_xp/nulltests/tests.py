@@ -25,6 +25,7 @@ from fdnt_xp.arrays import Array, Rows, array_namespace, blocks_in_cache, rows_o
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.transform import DeconvolvedStamps
 from fdnt_xp.nulltests.forms import ShearedForms, contract, sheared_forms
+from fdnt_xp.nulltests.scaled import scaled_tests
 from fdnt_xp.nulltests.weights import Weight
 
 
@@ -93,6 +94,8 @@ class TestNoise:
     flux, flux_variance : array, shape (n_gal,)
         Amplitude F of the Gaussian galaxy `F exp(-q sigma²/2)` that has the same sum under
         the weight.
+    scale_variance : array, shape (n_gal,)
+        Of t0 at fixed width.
     tests, matched : TestValues, MatchedWidth
         The raw tests and the width of the weight.
     """
@@ -103,6 +106,7 @@ class TestNoise:
     odd: Array
     flux: Array
     flux_variance: Array
+    scale_variance: Array
     tests: TestValues
     matched: MatchedWidth
 
@@ -211,26 +215,7 @@ class NullTests:
 
     def scaled(self, eta: Array, tests: TestValues, matched: MatchedWidth) -> tuple[Array, Array]:
         """Return what `evaluate` does, from the raw tests and the width at `eta`."""
-        xp = array_namespace(eta=eta)
-        # ln s = |eta|/2. At eta = 0 its slope has no direction; the mean of all is 0.
-        norm = xp.sqrt(eta[:, 0] ** 2 + eta[:, 1] ** 2)
-        safe = xp.where(norm > 0, norm, xp.ones_like(norm))
-        ln_shrink_slope = 0.5 * eta / safe[:, None]
-        ln_shrink_slope = xp.concat([ln_shrink_slope, xp.zeros_like(eta)], axis=-1)
-        width_slope = matched.by_parameter + matched.by_ln_shrink[:, None] * ln_shrink_slope
-        slopes = (
-            tests.by_parameter
-            + tests.by_ln_shrink[:, :, None] * ln_shrink_slope[:, None, :]
-            + tests.by_width[:, :, None] * width_slope[:, None, :]
-        )
-        scale = tests.values[:, 4:]
-        inverse = inverse_if_positive(scale)
-        raw = tests.values[:, :4] * inverse
-        jac = (slopes[:, :4, :] - raw[:, :, None] * slopes[:, 4:, :]) * inverse[:, :, None]
-        inv = 1.0 / self.length
-        f = xp.concat([raw[:, :2], inv * raw[:, 2:]], axis=-1)
-        jac = xp.concat([jac[:, :2, :], inv * jac[:, 2:, :]], axis=1)
-        return f, xp.concat([jac[:, :, :2], self.length * jac[:, :, 2:]], axis=2)
+        return scaled_tests(eta, tests, matched, self.length)
 
     def at(self, eta: Array, centroid: Array) -> tuple[TestValues, MatchedWidth]:
         """Return the raw tests and the width of the weight.
@@ -265,12 +250,13 @@ class NullTests:
         matched = self._matched_width(frame, moments, width)
         tests = self._tests(frame, moments, width.width)
         even = self._with_width_noise(frame, matched, tests.by_width, power)
-        sum_gauss = power.wg[:, 0]
+        sum_gauss, f0 = power.wg[:, 0], frame.forms.forms[0]
         return TestNoise(
             even=_symmetric(even),
             odd=_symmetric(power.ww[:, 1:4]),
             flux=moments.w_re[:, 0] / sum_gauss,
             flux_variance=power.ww[:, 0] / sum_gauss**2,
+            scale_variance=contract(contract(power.ww[:, 4:], f0), f0)[:, 0],
             tests=tests,
             matched=matched,
         )
@@ -474,13 +460,6 @@ def shrink_factor(eta: Array) -> Array:
     """Return `s = exp(|eta|/2)`, shape (n_gal,)."""
     xp = array_namespace(eta=eta)
     return xp.exp(0.5 * xp.sqrt(eta[:, 0] ** 2 + eta[:, 1] ** 2))
-
-
-def inverse_if_positive(scale: Array) -> Array:
-    """Return 1/x where x > 0, elsewhere NaN: tests over such a scale have no value."""
-    xp = array_namespace(scale=scale)
-    safe = xp.where(scale > 0, scale, xp.ones_like(scale))
-    return xp.where(scale > 0, 1.0 / safe, xp.full_like(scale, float("nan")))
 
 
 def _joined(parts: list[_Parts]) -> _Parts:
