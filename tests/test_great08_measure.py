@@ -23,7 +23,7 @@ from conftest import selected_backends
 from fdnt_xp.app import great08_run
 from fdnt_xp.app.great08_measure import ESTIMATORS, MeasureOptions, SetResult, SetShear
 from fdnt_xp.app.great08_run import measure_challenge
-from fdnt_xp.app.runner import find_noise
+from fdnt_xp.app.noise import find_noise
 from fdnt_xp.data.catalog import read_catalog
 from fdnt_xp.data.images import write_image
 from fdnt_xp.data.stamps import cube_stamps

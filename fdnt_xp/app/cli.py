@@ -10,18 +10,20 @@ import click
 
 import fdnt_xp
 from fdnt_xp.app.check import CheckOptions, run_check
-from fdnt_xp.app.command import HOW, OVERWRITE, WHERE, Command
+from fdnt_xp.app.command import HOW, JOBS, OVERWRITE, WHERE, Command
 from fdnt_xp.app.demo import Field, run_demo
 from fdnt_xp.app.exposures_command import measure_exposures_command
 from fdnt_xp.app.gradient_figure import GradientFigure, draw_gradient_figure
 from fdnt_xp.app.great08_commands import great08
-from fdnt_xp.app.measure import Inputs, Settings, measure_files
+from fdnt_xp.app.measure import Inputs, Settings
+from fdnt_xp.app.measure_run import measure_files
 from fdnt_xp.app.plots import check_figure, plot_catalog, save_figure
 from fdnt_xp.app.ring import RingOptions, run_ring
 from fdnt_xp.app.shear import catalog_shear, report_lines
 from fdnt_xp.app.summary import summary_lines
 from fdnt_xp.app.underfitting_figure import UnderfittingFigure, draw_underfitting_figure
-from fdnt_xp.data.catalog import check_catalog, read_catalog, write_catalog
+from fdnt_xp.app.workers import warn_of_too_many
+from fdnt_xp.data.catalog import read_catalog
 from fdnt_xp.data.noise_estimators import ESTIMATORS
 from fdnt_xp.data.versions import KINDS
 
@@ -52,7 +54,7 @@ def main() -> None:
     "--output",
     required=True,
     metavar="CATALOG",
-    help="Catalog to write: .fits, .ecsv or .parquet.",
+    help="Catalog to write: .fits, .ecsv, .parquet or .hdf5.",
 )
 @click.option(
     "--method",
@@ -85,6 +87,7 @@ def main() -> None:
     metavar="FILE",
     help="Of the shape of IMAGE: the inverse variance of each pixel, 0 where it is missing.",
 )
+@JOBS
 @HOW
 @OVERWRITE
 def measure(
@@ -100,6 +103,8 @@ def measure(
     noise_image: str | None,
     mask: str | None,
     weight: str | None,
+    jobs: int,
+    scheduler: str | None,
     overwrite: bool,
     **how: Any,
 ) -> None:
@@ -108,6 +113,9 @@ def measure(
     IMAGE is an image that is a grid of cells (--cell), an image with a table of positions
     (--positions, --stamp-size), or a cube of stamps: FITS or HDF5. FILE.fits[EXT] names an
     extension, FILE.h5::DATASET a dataset.
+
+    A command that was interrupted, or killed, goes on where it ended if it is given again:
+    what is finished is in the folder CATALOG.parts, which is removed at the end.
     """
     inputs = Inputs(
         image=image,
@@ -123,12 +131,12 @@ def measure(
         weight=weight,
     )
     settings = Settings(**how)
-    inputs.refuse_as_output(output)
-    check_catalog(output, overwrite=overwrite)
-    table, seconds = measure_files(inputs, settings)
-    write_catalog(table, output, overwrite=overwrite)
+    warn_of_too_many(jobs)
+    report = measure_files(
+        inputs, settings, output, overwrite=overwrite, jobs=jobs, scheduler=scheduler
+    )
     if not settings.quiet:
-        for line in summary_lines(table, seconds):
+        for line in summary_lines(report.kept, report.seconds, report.n_before):
             click.echo(line)
         click.echo(f"written    {output}")
 

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 import fdnt_xp.peers  # noqa: F401  gives its methods their names
 from fdnt_xp.app.backends import Backend, load_backend
-from fdnt_xp.app.runner import Noise, find_noise, measure_source
+from fdnt_xp.app.noise import Noise, find_noise
+from fdnt_xp.app.runner import measure_source
 from fdnt_xp.app.summary import measured_rows
 from fdnt_xp.arrays import Array, array_namespace, device_of
 from fdnt_xp.data.provenance import Value, provenance

@@ -16,11 +16,13 @@ from astropy.io import fits
 from astropy.utils.exceptions import AstropyWarning
 from numpy.typing import NDArray
 
+from fdnt_xp.data import fits_pixels
 from fdnt_xp.data.files import new_file
-from fdnt_xp.data.hdf5 import Hdf5Pixels, is_hdf5, open_hdf5
+from fdnt_xp.data.fits_pixels import FitsSections, map_pixels
+from fdnt_xp.data.hdf5 import Hdf5Pixels, is_hdf5, open_hdf5, split_name
 from fdnt_xp.errors import CatalogError, FdntError
 
-Pixels: TypeAlias = NDArray[Any] | Hdf5Pixels
+Pixels: TypeAlias = NDArray[Any] | Hdf5Pixels | FitsSections
 """Pixels as the file holds them: any number type, either byte order, perhaps on disk still."""
 
 _SHAPES = {2: "an image (ny, nx)", 3: "a cube (n, ny, nx)"}
@@ -124,6 +126,11 @@ def write_image(
         hdu.writeto(temporary)
 
 
+def image_file(path: str | os.PathLike[str]) -> Path:
+    """Return the file of a name that `read_image` takes."""
+    return split_name(path)[0] if is_hdf5(path) else _split(path)[0]
+
+
 def _of_rank(pixels: Pixels, ndim: Collection[int], name: str) -> Pixels:
     if pixels.ndim not in ndim:
         expected = " or ".join(_SHAPES.get(n, f"rank {n}") for n in sorted(ndim))
@@ -153,20 +160,26 @@ def _first_image(file: Path, extension: str | int | None, what: str) -> Pixels:
             chosen = [hdus[extension]]
         else:
             chosen = hdus
-        for number, hdu in enumerate(chosen):
+        for hdu in chosen:
             if hdu.is_image and hdu.shape and all(hdu.shape):
-                index = extension if extension is not None else number
                 break
         else:
             raise CatalogError(f"the {what} {file} holds no image")
-        try:
-            return np.asarray(hdu.data)
-        except ValueError as error:
-            if "memory-map" not in str(error):
-                raise
-    # Pixels that are stored scaled (BZERO, BSCALE) have to be computed.
+        index = hdus.index_of(hdu)
+        if not isinstance(hdu, fits.CompImageHDU):
+            try:
+                mapped = map_pixels(file, hdu)
+                return np.asarray(hdu.data) if mapped is None else mapped
+            except ValueError as error:
+                if "memory-map" not in str(error):
+                    raise
+    # Pixels that are packed, or stored scaled (BZERO, BSCALE), have to be computed.
     with fits.open(file, memmap=False) as hdus:
-        return np.asarray(hdus[index].data)
+        hdu = hdus[index]
+        first = np.asarray(hdu.section[:1])
+        if first.nbytes * hdu.shape[0] > fits_pixels.IN_MEMORY:
+            return FitsSections(file=file, number=index, shape=hdu.shape, dtype=first.dtype)
+        return np.asarray(hdu.data)
 
 
 def _truncation(caught: list[warnings.WarningMessage]) -> str | None:
