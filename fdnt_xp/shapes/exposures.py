@@ -126,8 +126,7 @@ def measure_exposures(
     -----
     The weight of a stamp is the square of the S/N of t0, the scale of the tests, at a first
     look at all exposures together, and stays: the summed tests are then linear in the
-    images, and vanish in the mean at the truth (docs, "Many exposures"). It is that S/N, not
-    the flux's, that tells what an exposure knows of the shape.
+    images, and vanish in the mean at the truth (docs, "Many exposures").
 
     Examples
     --------
@@ -171,8 +170,7 @@ def measure_exposures(
         n_chunk = chunk_size or galaxies_in_memory(job, given.pixels, transform, order)
         fill = order if transform == "hybrid" else None
         parts = [
-            _measure_batch(job, batch, fill, given.n_bands)
-            for batch in given.batches(n_chunk)
+            _measure_batch(job, batch, fill, given.n_bands) for batch in given.batches(n_chunk)
         ]
     return _in_order(given, parts)
 
