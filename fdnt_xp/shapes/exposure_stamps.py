@@ -26,6 +26,7 @@ from fdnt_xp.fourier.jacobian import pixel_scale, wave_frame
 from fdnt_xp.fourier.psf import Psf
 from fdnt_xp.nulltests.exposures import Exposures, by_object, spread_over_stamps
 from fdnt_xp.shapes.exposure_sources import StampSources, missing_fraction, with_gaps_filled
+from fdnt_xp.shapes.job import check_count
 from fdnt_xp.shapes.pixels import Pixels, check_pixels
 from fdnt_xp.shapes.sky import SkyFrame, sky_frame
 
@@ -230,7 +231,9 @@ def check_exposures(
     n_stamp = int(stamps.shape[0])
     index = _checked_numbers(xp, stamps, object_index, "object_index")
     highest = int(xp.max(index)) if n_stamp else -1
-    n_objects = highest + 1 if n_objects is None else int(n_objects)
+    n_objects = highest + 1 if n_objects is None else n_objects
+    check_count("n_objects", n_objects, 0)
+    n_objects = int(n_objects)
     if highest >= n_objects:
         raise FdntValueError(
             f"object_index goes up to {highest}, but n_objects is {n_objects}: it must be below"

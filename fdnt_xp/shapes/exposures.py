@@ -126,8 +126,7 @@ def measure_exposures(
     -----
     The weight of a stamp is the square of the S/N of t0, the scale of the tests, at a first
     look at all exposures together, and stays: the summed tests are then linear in the
-    images, and vanish in the mean at the truth (docs, "Many exposures"). It is that S/N, not
-    the flux's, that tells what an exposure knows of the shape.
+    images, and vanish in the mean at the truth (docs, "Many exposures").
 
     Examples
     --------
@@ -171,8 +170,7 @@ def measure_exposures(
         n_chunk = chunk_size or galaxies_in_memory(job, given.pixels, transform, order)
         fill = order if transform == "hybrid" else None
         parts = [
-            _measure_batch(job.take(batch.rows), batch, fill, given.n_bands)
-            for batch in given.batches(n_chunk)
+            _measure_batch(job, batch, fill, given.n_bands) for batch in given.batches(n_chunk)
         ]
     return _in_order(given, parts)
 
@@ -293,10 +291,11 @@ class _Seen:
 
 def _measure_batch(job: Job, batch: ExposureBatch, fill: int | None, n_bands: int) -> _Measured:
     """Measure objects with equally many stamps: on the coarse grid, the few that need it finer."""
+    every, job = job, job.take(batch.rows)
     sources, flags, missing = batch.sources(job.psf, fill)
     xp = array_namespace(flags=flags)
     shape, n_each = batch.pixels.stamp_shape, batch.exposures.n_each
-    inverse_transfer = job.psf.inverse_transfer(job.coarse)
+    inverse_transfer = _inverse_transfer(every, batch.rows, job)
     tests = _stamp_tests(job, job.coarse, sources, inverse_transfer)
     seen = look(
         tests,
@@ -331,6 +330,16 @@ def _measure_batch(job: Job, batch: ExposureBatch, fill: int | None, n_bands: in
         masked_fraction=xp.mean(by_object(missing, n_each), axis=1),
     )
     return _Measured(batch=batch, shapes=shapes, flags=seen.flags, snr=seen.snr)
+
+
+def _inverse_transfer(every: Job, rows: Array, job: Job) -> Array:
+    """Return 1/T of the stamps of a batch: of each PSF once where several stamps share it."""
+    psf = every.psf
+    if psf.index is None or psf.n_psf > int(rows.shape[0]):
+        return job.psf.inverse_transfer(every.coarse)
+    xp = array_namespace(rows=rows)
+    table = replace(psf, index=None).inverse_transfer(every.coarse)
+    return xp.take(table, psf.numbers_of(rows), axis=0)
 
 
 def _stamp_tests(

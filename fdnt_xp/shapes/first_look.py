@@ -2,7 +2,9 @@
 
 The dipoles of all exposures of an object are nulled together, under wide round weights. There
 each exposure is seen once as a round galaxy: the S/N of t0, the scale of the null tests, is
-the root of its weight. Fixed from there on, any weights make a null test.
+the root of its weight. The tests are then multiplied by `a = t0/Var(t0)`, which is linear in
+t0; the S/N of the flux would ask for a division by a t0 that may be noise. Fixed from there
+on, any weights make a null test.
 """
 
 from __future__ import annotations
