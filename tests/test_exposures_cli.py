@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import pickle
 from contextlib import chdir
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from click.testing import CliRunner
 
 from fdnt_xp.app import exposures as module
 from fdnt_xp.app.cli import main
+from fdnt_xp.app.parts import Rows
 from fdnt_xp.data.catalog import read_catalog
 from fdnt_xp.flags import FAILED, Flag
 from meds_files import SIGMA, SMALL, G, MedsObject, drawn_cutouts, objects_of, write_meds
@@ -92,6 +95,37 @@ def test_large_objects_are_measured_one_at_a_time_and_alike(folder, expected, mo
     table = catalog("tile.fits")
     for name in ("id", *SAME):
         np.testing.assert_allclose(table[name], expected[1][name], rtol=1e-6, atol=1e-8)
+
+
+def test_an_interrupted_command_goes_on(folder, expected, monkeypatch):
+    measure, done = module._measure_chunk, []
+
+    def measure_or_stop(files, rows, *options):
+        done.append(rows)
+        if len(done) == 2:
+            raise KeyboardInterrupt
+        return measure(files, rows, *options)
+
+    monkeypatch.setattr(module, "_measure_chunk", measure_or_stop)
+    command = ("tile.fits", "-o", "out.fits", "--chunk", 2)
+    assert "2 of 4 galaxies are in out.fits.parts" in run(*command, code=130)
+    assert "holds a run with --cutouts all, and this has first" in run(
+        *command, "--cutouts", "first", code=1
+    )
+    assert "resumed    2 of them were measured before" in run(*command)
+    assert done[1:] == [slice(2, 4)] * 2
+    assert not (folder / "out.fits.parts").exists()
+    table = read_catalog("out.fits")
+    for name in ("id", *SAME):
+        np.testing.assert_allclose(table[name], expected[1][name], rtol=1e-6, atol=1e-8)
+
+
+def test_other_processes_can_measure_a_part(folder, expected):
+    inputs = module.ExposureInputs(files=("tile.fits",)).absolute()
+    job = partial(module.measure_part, inputs=inputs, settings=module.ExposureSettings())
+    table = pickle.loads(pickle.dumps(job))(Rows(2, 4), report=None)
+    assert table["id"].tolist() == [102, 103]
+    np.testing.assert_allclose(table["g1"], expected[1]["g1"][2:], atol=1e-8)
 
 
 def test_all_but_the_first_cutout(folder, cutouts):

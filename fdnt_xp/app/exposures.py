@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
-import sys
-import time
-from collections.abc import Iterator
-from contextlib import ExitStack
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from fdnt_xp.app.backends import Backend, load_backend
+from fdnt_xp.app.chunks import ChunkSize
+from fdnt_xp.app.parts import PartsReport, PartsRun, Rows
+from fdnt_xp.app.resume import files_as_they_are
 from fdnt_xp.arrays import Array, to_numpy
 from fdnt_xp.data.bands import join_bands
+from fdnt_xp.data.catalog import check_catalog
 from fdnt_xp.data.exposures import ExposureBatch
-from fdnt_xp.data.images import native_pixels, read_image
+from fdnt_xp.data.images import image_file, native_pixels, read_image
 from fdnt_xp.data.meds import MedsFile, MedsOptions, Segments, open_meds
 from fdnt_xp.data.meds_index import Cutouts, chunk_ranges, equal_boxes
 from fdnt_xp.data.provenance import Value, provenance
-from fdnt_xp.data.row_batches import new_catalog
 from fdnt_xp.errors import CatalogError, ShapeMismatchError
 from fdnt_xp.fourier.psf import Psf
 from fdnt_xp.shapes.exposure_results import ExposureResult
@@ -34,8 +35,6 @@ if TYPE_CHECKING:
 
 METHODS: Final[dict[str, Fill]] = {"fdnt-ft": "ft", "fdnt-hybrid": "hybrid"}
 """What becomes of exposures with missing pixels, by the names that `measure` has for it."""
-_OBJECTS: Final = {True: 256, False: 8192}
-"""Of a chunk at most, on a CPU and on another device, unless told otherwise."""
 _PIXELS: Final = {True: 2**22, False: 2**26}
 """Of a chunk at most, if it is of several objects: of those that have a hundred exposures."""
 
@@ -75,10 +74,21 @@ class ExposureInputs:
             star=star,
         )
 
+    def paths(self) -> list[Path]:
+        """Return the files that are read."""
+        star = [] if self.psf is None else [image_file(self.psf)]
+        return [*map(Path, self.files), *star]
+
+    def absolute(self) -> ExposureInputs:
+        """Return the same with full names of the files."""
+        psf = None if self.psf is None else str(Path(self.psf).absolute())
+        files = tuple(str(Path(path).absolute()) for path in self.files)
+        return replace(self, files=files, psf=psf)
+
     def refuse_as_output(self, output: str) -> None:
         """Raise `CatalogError` if the output would replace one of the inputs."""
-        for path in (*self.files, self.psf):
-            if path is not None and Path(path).resolve() == Path(output).resolve():
+        for path in self.paths():
+            if path.resolve() == Path(output).resolve():
                 raise CatalogError(f"{output} is an input; choose another name for the output")
 
 
@@ -113,47 +123,111 @@ class ExposureSettings:
 
 
 def measure_exposure_files(
-    inputs: ExposureInputs, settings: ExposureSettings, output: str, *, overwrite: bool = False
-) -> tuple[Table, float]:
-    """Measure the objects of MEDS files, and write their catalog.
+    inputs: ExposureInputs,
+    settings: ExposureSettings,
+    output: str,
+    *,
+    overwrite: bool = False,
+    jobs: int = 1,
+    scheduler: str | None = None,
+) -> PartsReport:
+    """Measure the objects of MEDS files and write the catalog, as `measure_files` does.
 
-    Memory is that of one chunk, however many objects there are.
+    Memory is that of a chunk for each process. Until the catalog is whole, what is finished is
+    in the folder `OUTPUT.parts`, and the same call goes on with it.
+
+    Parameters
+    ----------
+    inputs : ExposureInputs
+    settings : ExposureSettings
+    output : str
+        The catalog.
+    overwrite : bool
+        Whether it may replace a file.
+    jobs, scheduler
+        Who measures: see `fdnt_xp.app.workers.open_workers`.
 
     Returns
     -------
-    astropy.table.Table
-        The columns of the catalog that a summary needs.
-    float
-        Seconds that it took.
+    PartsReport
+        With the columns that the closing summary needs.
 
     Raises
     ------
     ShapeMismatchError
         If the files are of different objects.
+    FdntError
+        If something cannot be read, measured or written.
     """
-    backend = load_backend(settings.backend, settings.device, settings.dtype)
     inputs.refuse_as_output(output)
-    start = time.perf_counter()
+    check_catalog(output, overwrite=overwrite)
+    backend = load_backend(settings.backend, settings.device, settings.dtype)
+    size = ChunkSize(settings.chunk, backend).size
+    with _opened(inputs) as files:
+        n_objects = files[0].index.n_objects
+        facts = _facts(inputs, settings, backend, files)
+    run = PartsRun(
+        output=Path(output),
+        n_gal=n_objects,
+        chunk=1,
+        largest_part=size,  # of many stamps each: a kill should not cost more
+        command="measure-exposures",
+        options=_options(inputs, settings),
+        shown={"files": "FILE"} | {str(path): f"{path} of" for path in inputs.paths()},
+        overwrite=overwrite,
+    )
+    return run.make(
+        partial(measure_part, inputs=inputs.absolute(), settings=settings),
+        lambda _found: facts,
+        keep=() if settings.quiet else ("flags", "e1", "e2"),
+        jobs=jobs,
+        scheduler=scheduler,
+        quiet=settings.quiet,
+    )
+
+
+def measure_part(
+    rows: Rows,
+    *,
+    inputs: ExposureInputs,
+    settings: ExposureSettings,
+    report: Callable[[int], object] | None,
+) -> Table:
+    """Measure some objects, in whatever process; see `fdnt_xp.app.parts.PartJob`."""
+    backend = load_backend(settings.backend, settings.device, settings.dtype)
+    size = ChunkSize(settings.chunk, backend)
+    with _opened(inputs) as files:
+
+        def measure(start: int, stop: int) -> Table:
+            table = _measure_chunk(files, slice(start, stop), settings, backend)
+            if report is not None:
+                report(len(table))
+            return table
+
+        pixels = np.sum([file.index.pixels_per_object for file in files], axis=0)[slice(*rows)]
+        most = _PIXELS[backend.on_cpu]
+        tables: list[Table] = []
+        for part in chunk_ranges(pixels, most_objects=size.size, most_pixels=most):
+            tables += size.each(rows.start + part.start, rows.start + part.stop, measure)
+        # An empty file still gives its one table, of no rows.
+        return _stacked(tables or [measure(rows.start, rows.stop)])
+
+
+@contextmanager
+def _opened(inputs: ExposureInputs) -> Iterator[list[MedsFile]]:
+    """Open the files of all bands, and see that they are of the same objects."""
+    options = inputs.options()
     with ExitStack() as stack:
-        options = inputs.options()
         files = [stack.enter_context(open_meds(path, options)) for path in inputs.files]
         _check_objects(files)
-        meta = _facts(inputs, settings, backend, files)
-        catalog = stack.enter_context(new_catalog(output, overwrite=overwrite, meta=meta))
-        noted = []
-        bar = tqdm(
-            total=files[0].index.n_objects,
-            unit=" objects",
-            leave=False,
-            disable=settings.quiet or not sys.stderr.isatty(),
-        )
-        with bar:
-            for rows in _chunks(files, settings.chunk, backend):
-                table = _measure_chunk(files, rows, settings, backend)
-                catalog.append(table)
-                noted.append(table["e1", "e2", "flags"])
-                bar.update(len(table))
-    return _stacked(noted), time.perf_counter() - start
+        yield files
+
+
+def _options(inputs: ExposureInputs, settings: ExposureSettings) -> dict[str, Any]:
+    """Return what must be the same when a run is resumed: the files too, as they are now."""
+    options = {**asdict(inputs), **asdict(settings), "files": list(inputs.files)}
+    del options["quiet"]
+    return options | files_as_they_are(inputs.paths())
 
 
 def _check_objects(files: list[MedsFile]) -> None:
@@ -163,16 +237,6 @@ def _check_objects(files: list[MedsFile]) -> None:
                 f"{other.path} is of other objects than {files[0].path}: the column id must be "
                 "the same in the files of all bands"
             )
-
-
-def _chunks(files: list[MedsFile], chunk: int | None, backend: Backend) -> Iterator[slice]:
-    """Yield ranges of objects, at least one: an empty file still gives an empty table."""
-    pixels = np.sum([file.index.pixels_per_object for file in files], axis=0)
-    most = chunk or _OBJECTS[backend.on_cpu]
-    most_pixels = _PIXELS[backend.on_cpu]
-    yield from chunk_ranges(pixels, most_objects=most, most_pixels=most_pixels)
-    if not len(pixels):
-        yield slice(0, 0)
 
 
 def _measure_chunk(

@@ -6,10 +6,10 @@ from typing import Any
 
 import click
 
-from fdnt_xp.app.command import OVERWRITE, WHERE, Command
+from fdnt_xp.app.command import JOBS, OVERWRITE, WHERE, Command
 from fdnt_xp.app.exposures import METHODS, ExposureInputs, ExposureSettings, measure_exposure_files
 from fdnt_xp.app.summary import summary_lines
-from fdnt_xp.data.catalog import check_catalog
+from fdnt_xp.app.workers import warn_of_too_many
 from fdnt_xp.data.meds import SEGMENTS
 from fdnt_xp.data.meds_index import CUTOUTS
 
@@ -57,6 +57,7 @@ from fdnt_xp.data.meds_index import CUTOUTS
 @click.option(
     "--noise-variance", type=float, metavar="V", help="Of one pixel, for files without weights."
 )
+@JOBS
 @WHERE
 @click.option(
     "--oversampling",
@@ -87,6 +88,8 @@ def measure_exposures_command(
     segments: Any,
     psf: str | None,
     noise_variance: float | None,
+    jobs: int,
+    scheduler: str | None,
     overwrite: bool,
     **how: Any,
 ) -> None:
@@ -94,6 +97,9 @@ def measure_exposures_command(
 
     Each FILE is a multi-epoch data structure of one band, as FITS, packed or not; several are
     of the same objects. Shapes are those on the sky.
+
+    A command that was interrupted, or killed, goes on where it ended if it is given again, as
+    measure does.
     """
     inputs = ExposureInputs(
         files=files,
@@ -104,9 +110,11 @@ def measure_exposures_command(
         noise_variance=noise_variance,
     )
     settings = ExposureSettings(**how)
-    check_catalog(output, overwrite=overwrite)
-    table, seconds = measure_exposure_files(inputs, settings, output, overwrite=overwrite)
+    warn_of_too_many(jobs)
+    report = measure_exposure_files(
+        inputs, settings, output, overwrite=overwrite, jobs=jobs, scheduler=scheduler
+    )
     if not settings.quiet:
-        for line in summary_lines(table, seconds):
+        for line in summary_lines(report.kept, report.seconds, report.n_before):
             click.echo(line)
         click.echo(f"written    {output}")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import secrets
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -16,6 +15,7 @@ from fdnt_xp.app.measure import Inputs, Settings, open_beside, open_source
 from fdnt_xp.app.noise import Noise, find_noise
 from fdnt_xp.app.parts import PartsReport, PartsRun, Rows
 from fdnt_xp.app.responses import common_size, response_measurer
+from fdnt_xp.app.resume import files_as_they_are
 from fdnt_xp.app.runner import ChunkPsfs, MeasureChunk, measure_rows, shape_measurer
 from fdnt_xp.data.catalog import check_catalog
 from fdnt_xp.data.images import read_image
@@ -229,11 +229,7 @@ def _options(inputs: Inputs, settings: Settings) -> dict[str, Any]:
     """Return what must be the same when a run is resumed: the files too, as they are now."""
     options = {**asdict(inputs), **asdict(settings)}
     del options["quiet"]
-    for path in inputs.files():
-        now = path.stat()
-        changed = datetime.fromtimestamp(now.st_mtime, UTC).isoformat()
-        options[str(path)] = f"{now.st_size} bytes, {changed}"
-    return options
+    return options | files_as_they_are(inputs.files())
 
 
 def _facts(

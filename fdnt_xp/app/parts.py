@@ -99,6 +99,10 @@ class PartsRun:
         What the user calls them.
     overwrite : bool
         Whether the catalog may replace a file.
+    largest_part : int, optional
+        Galaxies in a part, at most; `PART` without it.
+    command : str
+        Whose run it is.
     """
 
     output: Path
@@ -107,6 +111,8 @@ class PartsRun:
     options: Mapping[str, Any]
     shown: Mapping[str, str]
     overwrite: bool = False
+    largest_part: int | None = None
+    command: str = "measure"
 
     @property
     def folder(self) -> Path:
@@ -174,12 +180,13 @@ class PartsRun:
     def _begin(self, jobs: int) -> list[Rows]:
         """Return all parts: those of the run that was begun, if there is one."""
         self._remove_if_empty()
-        share = math.ceil(self.n_gal / (_PARTS_PER_JOB * jobs)) if jobs > 1 else PART
-        n_chunks = max(min(share, PART) // self.chunk, 1)
+        most = self.largest_part or PART
+        share = math.ceil(self.n_gal / (_PARTS_PER_JOB * jobs)) if jobs > 1 else most
+        n_chunks = max(min(share, most) // self.chunk, 1)
         choices = begin_run(
             self.folder,
             {"galaxies": self.n_gal, **self.options},
-            command="measure",
+            command=self.command,
             remedy=f"remove {self.folder}",
             shown=self.shown,
             choices={"part": n_chunks * self.chunk},

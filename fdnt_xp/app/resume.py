@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
@@ -73,6 +74,16 @@ def begin_run(
         run["choices"] = dict(choices)
     write_json(run, str(path), overwrite=False)
     return dict(choices or {})
+
+
+def files_as_they_are(paths: Iterable[Path]) -> dict[str, str]:
+    """Return the size and the last change of each file, to tell whether it is another one."""
+    states = {}
+    for path in paths:
+        now = path.stat()
+        changed = datetime.fromtimestamp(now.st_mtime, UTC).isoformat()
+        states[str(path)] = f"{now.st_size} bytes, {changed}"
+    return states
 
 
 def tidy(folder: Path, unfinished: Collection[str]) -> None:
