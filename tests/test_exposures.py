@@ -299,7 +299,7 @@ def test_slopes_of_the_sums(drawn):
 
 @pytest.fixture(scope="module")
 def noisy():
-    """Return 600 times a galaxy in four exposures, S/N 50, 100, 50 and 25, and those without noise."""
+    """Return a galaxy in four exposures 600 times, S/N 50, 100, 50 and 25, and without noise."""
     clean = drawn_objects([gaussian_covariance((0.2, -0.1), 2.4 * SCALE)], OFFSETS[:1], (40, 40))
     signal = np.sqrt(np.sum(clean.stamps**2, axis=(1, 2)))
     sigma = signal / np.array([50.0, 100.0, 50.0, 25.0])

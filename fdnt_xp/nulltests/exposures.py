@@ -2,9 +2,10 @@
 
 The exposures of an object share the shape eta and the centroid u on the sky, counted from a
 point that lies at `origin` on each stamp. There the centroid is `x = origin + J⁻¹ u`, and as
-`k = Jᵀ k_sky` the dipole along the sky is `J⁻ᵀ (tx, ty)`. With fixed coefficients a_e,
+`k = Jᵀ k_sky` the dipole along the sky is `J⁻ᵀ (tx, ty)`. With fixed coefficients a_e::
 
-    t = sum_e a_e (t1, t2, |det J| J⁻ᵀ (tx, ty), t0)_e,     f = (t1, t2, tx/L, ty/L)/t0.
+    t = sum_e a_e (t1, t2, |det J| J⁻ᵀ (tx, ty), t0)_e
+    f = (t1, t2, tx/L, ty/L)/t0.
 
 The numerators are linear in the images: at a given size of the weights their mean vanishes at
 the truth, whatever the noise of each exposure. Quotients of single exposures would not have
