@@ -19,6 +19,7 @@ from fdnt_xp.data.catalog import read_catalog
 from fdnt_xp.flags import FAILED, Flag
 from meds_files import SIGMA, SMALL, G, MedsObject, drawn_cutouts, objects_of, write_meds
 
+SKY = np.array([[40.0, -1.0], [40.1, -1.1], [40.2, -1.2], [40.3, -1.3]])
 SAME = ("g1", "g2", "eta1_var", "eta12_cov", "u", "v", "size", "flux", "snr", "flags", "n_used")
 
 
@@ -30,7 +31,8 @@ def cutouts():
 @pytest.fixture(scope="module")
 def made(cutouts, tmp_path_factory):
     """Return a MEDS file of four objects, of which the third has no cutouts."""
-    return write_meds(tmp_path_factory.mktemp("meds") / "tile.fits", objects_of(cutouts))
+    path = tmp_path_factory.mktemp("meds") / "tile.fits"
+    return write_meds(path, objects_of(cutouts), ra=SKY[:, 0], dec=SKY[:, 1])
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +67,9 @@ def test_one_true_shape_of_all_exposures(expected):
     assert "measured   3 of 4 galaxies" in said
     assert "NO_EXPOSURE" in said
     assert table["id"].tolist() == [100, 101, 102, 103]
+    np.testing.assert_array_equal(table["ra"], SKY[:, 0])
+    np.testing.assert_array_equal(table["dec"], SKY[:, 1])
+    assert table["dec"].unit == "deg"
     assert table["n_exposures"].tolist() == [3, 2, 0, 3]
     assert table["n_used"].tolist() == [3, 2, 0, 3]
     assert table["flags"][2] == int(Flag.NO_EXPOSURE)
@@ -140,6 +145,7 @@ def test_bands_are_files_of_the_same_objects(folder, cutouts, expected):
     for name, part in (("g", first), ("r", second)):
         write_meds(folder / f"{name}.fits", objects_of(part))
     table = catalog("g.fits", "r.fits")
+    assert "ra" not in table.colnames
     assert table["n_exposures"].tolist() == [3, 1, 0, 2]
     np.testing.assert_allclose(table["g1"][[0, 1, 3]], G[[0, 1, 3], 0], atol=2e-5)
     np.testing.assert_array_equal(np.isnan(table["flux_1"]), [False, True, True, False])

@@ -247,7 +247,14 @@ def _measure_chunk(
     groups = equal_boxes(boxes, rows)
     measured = (_measure(_read(files, group), settings, backend) for group in groups)
     tables = [_with_bands(table, len(files)) for table in measured]
-    return _stacked(tables)[np.argsort(np.concatenate(groups))]
+    table = _stacked(tables)[np.argsort(np.concatenate(groups))]
+    ra_dec = files[0].index.ra_dec
+    if ra_dec is not None:
+        for place, name in enumerate(("ra", "dec")):
+            table.add_column(ra_dec[rows, place], name=name, index=1 + place)
+            table[name].unit = "deg"
+            table[name].description = f"{name} of the object in the file"
+    return table
 
 
 def _read(files: list[MedsFile], rows: NDArray[np.int64]) -> ExposureBatch:

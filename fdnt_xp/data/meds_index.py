@@ -49,6 +49,8 @@ class CutoutIndex:
         (rows, columns) of its PSF.
     n_lost : int
         Cutouts that the table promises but no pixels hold; they are left out.
+    ra_dec : array, shape (n_objects, 2), optional
+        Columns `ra` and `dec` in degrees, if there are any.
     """
 
     ids: NDArray[Any]
@@ -61,6 +63,7 @@ class CutoutIndex:
     psf_starts: NDArray[np.int64]
     psf_shapes: NDArray[np.int64]
     n_lost: int
+    ra_dec: NDArray[np.float64] | None = None
 
     @property
     def n_objects(self) -> int:
@@ -157,12 +160,16 @@ def index_cutouts(
         flat["psf_starts"] = of("psf_start_row", np.int64)
         flat["psf_shapes"] = np.stack([rows, columns], axis=-1)
         whole &= _inside(flat["psf_starts"], rows, columns, psf_length)
+    ra_dec = None
+    if {"ra", "dec"} <= set(names):
+        ra_dec = np.stack([column("ra"), column("dec")], axis=-1).astype(np.float64)
     ids = column("id") if "id" in names else np.arange(len(data))
     return CutoutIndex(
         ids=ids,
         numbers=column("number") if "number" in names else ids,
         **{name: values[whole] for name, values in flat.items()},
         n_lost=int(np.sum(~whole)),
+        ra_dec=ra_dec,
     )
 
 
