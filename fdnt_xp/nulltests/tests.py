@@ -351,8 +351,9 @@ class NullTests:
         if self.fixed_width is not None:
             zero = xp.zeros_like(flux)
             return _Width(width=self.fixed_width, slope=zero, at_bound=zero > 0)
-        # A mean square that noise made negative or tiny asks for the widest weight.
-        positive = (square > 0) & (flux > 0)
+        # A mean square that noise made negative or tiny asks for the widest weight; and
+        # pixels beyond all range, whose ratio would be NaN, for any.
+        positive = (square > 0) & (flux > 0) & xp.isfinite(flux)
         safe = xp.where(positive, square, xp.ones_like(square))
         inverse = xp.where(positive, flux / safe, xp.full_like(flux, 1e30))
         width, slope, at_bound = self.weight.matched_width(inverse, shrink)
