@@ -42,6 +42,8 @@ class SeenObjects:
     n_bands : int
     stamp_shape : tuple of int
         (ny, nx).
+    n_at_once : int
+        Stamps that fit the memory together.
     """
 
     job: Job
@@ -51,6 +53,7 @@ class SeenObjects:
     band: Array | None
     n_bands: int
     stamp_shape: tuple[int, int]
+    n_at_once: int
 
     def take(self, rows: Array) -> SeenObjects:
         """Return the given objects (integer array)."""
@@ -195,7 +198,9 @@ def _solved_on(
     start = round_start(objects.look.offset, job.length)
     root = search(tests, start, known, max_iter=max_iter, last_step_free=last_step_free)
     eta, centroid = tests.on_stamps(root.x)
-    noise = objects.sources.noise(tests.stamps, eta, centroid, inverse_transfer)
+    noise = objects.sources.noise(
+        tests.stamps, eta, centroid, inverse_transfer, n_at_once=objects.n_at_once
+    )
     summed, matched = tests.summed(noise.tests, noise.matched)
     if last_step_free:
         root = looked_at(root, *tests.scaled(root.x[:, :2], summed, matched))

@@ -78,14 +78,30 @@ class StampSources:
         return self.every.deconvolved(inverse_transfer, grid)
 
     def noise(
-        self, tests: NullTests, eta: Array, centroid: Array, inverse_transfer: Array
+        self,
+        tests: NullTests,
+        eta: Array,
+        centroid: Array,
+        inverse_transfer: Array,
+        *,
+        n_at_once: int,
     ) -> SolutionNoise:
-        """Return the noise of the tests at a solution; see `NullTests.noise`."""
-        noise = self.every.noise(tests, eta, centroid, inverse_transfer)
+        """Return the noise of the tests at a solution; see `NullTests.noise`.
+
+        That of pixels with an `ivar` is `n_at_once` stamps at a time: it needs more memory
+        than all else, and one object can have any number of stamps.
+        """
+        shared = int(inverse_transfer.shape[0]) == 1
+        parts = []
+        for first in range(0, self.every.n_gal, n_at_once):
+            rows = slice(first, min(first + n_at_once, self.every.n_gal))
+            inverse = inverse_transfer if shared else inverse_transfer[rows, :]
+            some = self.every.take(rows)
+            parts.append(some.noise(tests.take(rows), eta[rows, :], centroid[rows, :], inverse))
+        noise = SolutionNoise.concat(parts)
         if self.filled is None or self.rank is None:
             return noise
         rows = _rows_where(self.rank >= 0)
-        shared = int(inverse_transfer.shape[0]) == 1
         more = self.filled.noise(
             tests.take(rows),
             rows_of(eta, rows),

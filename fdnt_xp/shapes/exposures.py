@@ -156,10 +156,9 @@ def measure_exposures(
         seen, fixed = given.seen_by(psf), given.fixed_size(size)
         job = prepare(xp, stamps, seen, padding=padding, size=fixed, max_iter=max_iter)
         n_chunk = chunk_size or galaxies_in_memory(job, given.pixels, transform, order)
-        fill = order if transform == "hybrid" else None
-        parts = [
-            _measure_batch(job, batch, fill, given.n_bands) for batch in given.batches(n_chunk)
-        ]
+        fill, bands = order if transform == "hybrid" else None, given.n_bands
+        batches = given.batches(n_chunk)
+        parts = [_measure_batch(job, batch, fill, bands, n_chunk) for batch in batches]
     return _in_order(given, parts)
 
 
@@ -173,7 +172,9 @@ class _Measured:
     snr: Array
 
 
-def _measure_batch(job: Job, batch: ExposureBatch, fill: int | None, n_bands: int) -> _Measured:
+def _measure_batch(
+    job: Job, batch: ExposureBatch, fill: int | None, n_bands: int, n_at_once: int
+) -> _Measured:
     """Measure objects with equally many stamps: on the coarse grid, the few that need it finer."""
     every, job = job, job.take(batch.rows)
     sources, flags, missing = batch.sources(job.psf, fill)
@@ -198,6 +199,7 @@ def _measure_batch(job: Job, batch: ExposureBatch, fill: int | None, n_bands: in
         band=batch.band,
         n_bands=n_bands,
         stamp_shape=shape,
+        n_at_once=n_at_once,
     )
     used = seen.flags == 0
     n_used = xp.sum(xp.astype(by_object(used, n_each), xp.int32), axis=1, dtype=xp.int32)
