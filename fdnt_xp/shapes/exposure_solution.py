@@ -198,10 +198,14 @@ def _solved_on(
     start = round_start(objects.look.offset, job.length)
     root = search(tests, start, known, max_iter=max_iter, last_step_free=last_step_free)
     eta, centroid = tests.on_stamps(root.x)
+    stamps, widths = tests.stamps, None
+    if exposures.n_each > 1 and tests.fixed_width is None:
+        widths = stamps.widths(eta, centroid)
+        stamps = tests.of_one_size(widths)
     noise = objects.sources.noise(
-        tests.stamps, eta, centroid, inverse_transfer, n_at_once=objects.n_at_once
+        stamps, eta, centroid, inverse_transfer, n_at_once=objects.n_at_once
     )
-    summed, matched = tests.summed(noise.tests, noise.matched)
+    summed, matched = tests.summed(noise.tests, noise.matched if widths is None else widths)
     if last_step_free:
         root = looked_at(root, *tests.scaled(root.x[:, :2], summed, matched))
     flux, variance = _mean_flux(exposures, noise, objects.look.flux_share)
