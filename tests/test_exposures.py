@@ -344,9 +344,39 @@ def test_errors_go_with_the_root_of_the_exposures(drawn):
     }
     many = drawn.measured(stamps=drawn.stamps[same], object_index=same, **options)
     one = drawn.measured(slice(0, 1), **(options | {"origin": drawn.origin[:1]}))
-    np.testing.assert_allclose(16.0 * many.eta_cov, one.eta_cov, rtol=1e-9)
+    # The noise of a common size is left out; it moves no test of an ellipse but by rounding.
+    np.testing.assert_allclose(16.0 * many.eta_cov, one.eta_cov, rtol=1e-6)
     np.testing.assert_allclose(many.snr, 4.0 * one.snr, rtol=1e-9)
     np.testing.assert_allclose(many.flux, one.flux, rtol=1e-9)
+
+
+def test_faint_exposures_are_worth_one_deep():
+    # 36 of S/N 8 and one of S/N 48, on average. Were each exposure's size its own, 1.3.
+    psf = gaussian_covariance((0.0, 0.1), 1.8)
+    stamp = gaussian_image(gaussian_covariance((0.3, 0.0), 2.4) + psf, (40, 40))
+    sigma = np.sqrt(np.sum(stamp**2)) / 8.0
+    noise = sigma * np.random.default_rng(4).standard_normal((40 * 36, 40, 40))
+    star_ = fx.Psf.from_image(gaussian_image(psf, (40, 40)))
+    faint = fx.measure_exposures(
+        stamp + noise, star_, object_index=np.repeat(np.arange(40), 36), noise_variance=sigma**2
+    )
+    deep = fx.measure_shapes(stamp[None], star_, noise_variance=sigma**2 / 36)
+    assert bool(np.all(faint.measured))
+    ratio = np.median(faint.eta_cov[:, [0, 1], [0, 1]], axis=0) / deep.eta_cov[0, [0, 1], [0, 1]]
+    assert np.all(np.abs(np.sqrt(ratio) - 1.0) < 0.08)
+
+
+def test_the_same_exposure_twice_is_that_exposure(rings):
+    rows = np.repeat(np.arange(8), 2)
+    options = {"jacobian": JACOBIANS[2]}
+    psf = fx.Psf.from_image(rings.stars[2])
+    one = rings.measured(np.arange(2, 32, 4), psf=psf, **options)
+    two = rings.measured(np.repeat(np.arange(2, 32, 4), 2), psf=psf, object_index=rows, **options)
+    for name in ("eta", "eg", "size", "sky_offset"):
+        np.testing.assert_allclose(getattr(two, name), getattr(one, name), atol=1e-11)
+    # The noise of the size is left out, of a galaxy with a gradient.
+    cov = one.eta_cov[:, [0, 1], [0, 1]]
+    np.testing.assert_allclose(2.0 * two.eta_cov[:, [0, 1], [0, 1]], cov, rtol=0.02)
 
 
 def test_units_of_an_exposure_do_not_matter(drawn, reference):
@@ -432,7 +462,9 @@ def test_exposures_that_fail_are_recorded_and_change_nothing(drawn):
     assert shapes.stamp_used.tolist() == [i in good for i in range(16)]
     assert shapes.n_used.tolist() == [3, 2, 2, 2]
     assert shapes.n_exposures.tolist() == [4] * 4
-    assert_same(shapes, drawn.measured(good))
+    without = drawn.measured(good)
+    assert_same(shapes, without)
+    np.testing.assert_allclose(shapes.centroid, without.centroid, atol=1e-9)
     np.testing.assert_allclose(shapes.e, E, atol=2e-6)
 
 
@@ -448,6 +480,7 @@ def test_objects_without_exposures_and_with_bad_ones_only(drawn, reference):
     assert shapes.n_used.tolist() == [4, 0, 0, 4, 0, 4, 0, 0]
     assert np.all(np.isnan(shapes.eta[~shapes.measured]))
     assert np.all(np.isnan(shapes.sky_offset[~shapes.measured]))
+    assert np.all(np.isnan(shapes.centroid[~shapes.measured]))
     np.testing.assert_allclose(shapes.eta[[0, 5, 3]], reference.eta[[0, 2, 3]], atol=1e-12)
 
 

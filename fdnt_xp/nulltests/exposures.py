@@ -98,9 +98,17 @@ class Exposures:
 
     def add_slopes(self, slopes: Array, first: int) -> Array:
         """Return the same for slopes, of which the last two are by the centroid."""
+        return self.add(self.by_sky(slopes), first)
+
+    def by_sky(self, slopes: Array) -> Array:
+        """Return slopes, (n_stamp, m, d), with the last two by the centroid on the sky."""
         xp = array_namespace(slopes=slopes)
         by_sky = xp.sum(slopes[:, :, -2:, None] * self.to_stamp[:, None, :, :], axis=2)
-        return self.add(xp.concat([slopes[:, :, :-2], by_sky], axis=-1), first)
+        return xp.concat([slopes[:, :, :-2], by_sky], axis=-1)
+
+    def mean_width(self, width: Array) -> Array:
+        """Return the mean of widths of weights, pixel², on the sky; (n_obj, d)."""
+        return self.total(width * (self.share * self.area)[:, None])
 
     def add_covariances(self, covariances: Array) -> Array:
         """Return the covariances, (n_obj, 4, 4), of the sums from those of (t1, t2, tx, ty)."""
@@ -128,8 +136,9 @@ class Exposures:
 class ExposureTests:
     """The null tests of a batch of objects: a `RootProblem` in `(eta1, eta2, u/L, v/L)`.
 
-    Each stamp has the weight of its own PSF and its own size: exposures need not show the
-    same profile, as in several bands.
+    Each stamp has the weight of its own PSF. Their Gaussian parts have one size on the sky,
+    the mean of those that each exposure asks for, with weights `share`: the size of an
+    exposure alone is as noisy as its tests, and goes with them.
 
     Parameters
     ----------
@@ -158,8 +167,25 @@ class ExposureTests:
 
     def evaluate(self, x: Array) -> tuple[Array, Array]:
         """Return the scaled sums, shape (n_obj, 4), and their Jacobian; see `NullTests`."""
-        tests, matched = self.stamps.at(*self.on_stamps(x))
+        eta, centroid = self.on_stamps(x)
+        if self.exposures.n_each == 1 or self.fixed_width is not None:
+            tests, matched = self.stamps.at(eta, centroid)
+        else:
+            matched = self.stamps.widths(eta, centroid)
+            tests, _ = self.of_one_size(matched).at(eta, centroid)
         return self.scaled(x[:, :2], *self.summed(tests, matched))
+
+    def of_one_size(self, matched: MatchedWidth) -> NullTests:
+        """Return the tests of the stamps with weights of the common size, held.
+
+        Parameters
+        ----------
+        matched : MatchedWidth
+            What each stamp asks for.
+        """
+        width = self.exposures.mean_width(matched.width[:, None])
+        width = self.exposures.spread(width)[:, 0] / self.exposures.area
+        return replace(self.stamps, fixed_width=width)
 
     def scaled(self, eta: Array, tests: TestValues, matched: MatchedWidth) -> tuple[Array, Array]:
         """Return what `evaluate` does, from the sums at `eta`."""
@@ -171,38 +197,32 @@ class ExposureTests:
         return self.exposures.spread(x[:, :2]), self.exposures.centroids(offset)
 
     def summed(self, tests: TestValues, matched: MatchedWidth) -> tuple[TestValues, MatchedWidth]:
-        """Return the sums over exposures, and their mean width.
-
-        As the size of each weight follows its own exposure, its slopes are in those of the
-        sums, and none is left by a common size.
+        """Return the sums over exposures, and the common width.
 
         Parameters
         ----------
         tests, matched : TestValues, MatchedWidth
-            Of the stamps.
+            Of the stamps: the tests at the common size, and the sizes they ask for.
         """
+        add, mean = self.exposures.add, self.exposures.mean_width
         xp = array_namespace(values=tests.values)
-        add = self.exposures.add
-        by_width = tests.by_width[:, :, None]
-        by_parameter = tests.by_parameter + by_width * matched.by_parameter[:, None, :]
-        by_ln_shrink = tests.by_ln_shrink + tests.by_width * matched.by_ln_shrink[:, None]
-        values = add(tests.values[:, :, None], 2)[:, :, 0]
-        held = self.exposures.total(xp.astype(matched.at_bound, values.dtype))
-        width = self.exposures.share * self.exposures.area * matched.width
-        zero = xp.zeros_like(values[:, 0])
+        # The width of a stamp, in its pixels, is that on the sky over the area of a pixel.
+        by_width = tests.by_width / self.exposures.area[:, None]
+        by_parameter = self.exposures.by_sky(matched.by_parameter[:, None, :])[:, 0, :]
+        held = xp.astype(matched.at_bound, tests.values.dtype) / self.exposures.area
         return TestValues(
-            values=values,
-            by_parameter=self.exposures.add_slopes(by_parameter, 2),
-            by_ln_shrink=add(by_ln_shrink[:, :, None], 2)[:, :, 0],
-            by_width=xp.zeros_like(values),
+            values=add(tests.values[:, :, None], 2)[:, :, 0],
+            by_parameter=self.exposures.add_slopes(tests.by_parameter, 2),
+            by_ln_shrink=add(tests.by_ln_shrink[:, :, None], 2)[:, :, 0],
+            by_width=add(by_width[:, :, None], 2)[:, :, 0],
         ), MatchedWidth(
-            width=self.exposures.total(width),
-            by_parameter=xp.zeros_like(values[:, :4]),
-            by_ln_shrink=zero,
-            by_ln_square=zero,
-            flux=zero,
-            square=zero,
-            at_bound=held > 0,
+            width=mean(matched.width[:, None])[:, 0],
+            by_parameter=mean(by_parameter),
+            by_ln_shrink=mean(matched.by_ln_shrink[:, None])[:, 0],
+            by_ln_square=mean(matched.by_ln_square[:, None])[:, 0],
+            flux=self.exposures.total(matched.flux),
+            square=self.exposures.total(matched.square),
+            at_bound=mean(held[:, None])[:, 0] > 0.5,
         )
 
 

@@ -140,16 +140,21 @@ class _Width:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Moments:
-    """All that the tests and their slopes need of the fields; (n_gal, number of moments).
+class _SizeMoments:
+    """What the size equation and its slopes need of the fields; (n_gal, number of moments).
 
-    `𝒯' = d𝒯/dq`, G is the Gaussian part of the weight, and W = 𝒯 G; the moments are those of
-    the degrees named.
+    `𝒯' = d𝒯/dq`; the moments are those of the degrees named.
     """
 
     t_re: Array  # 𝒯 Re: 0, 2
     t_im: Array  # 𝒯 Im: 1, 3
     dt_re: Array  # 𝒯' Re: 2, 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Moments(_SizeMoments):
+    """And what the tests and their slopes need; W = 𝒯 G, G the Gaussian part of the weight."""
+
     w_re: Array  # W Re: 0, 2, 4
     w_im: Array  # W Im: 1, 3
     dw_re: Array  # 𝒯' G Re: 4
@@ -166,7 +171,7 @@ class _PowerMoments:
     wg: Array  # W G: 0
 
 
-_Parts = TypeVar("_Parts", _Moments, _Width, _PowerMoments)
+_Parts = TypeVar("_Parts", _SizeMoments, _Moments, _Width, _PowerMoments)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -230,6 +235,18 @@ class NullTests:
         moments, width, _ = self._moments(frame, centroid)
         matched = self._matched_width(frame, moments, width)
         return self._tests(frame, moments, width.width), matched
+
+    def widths(self, eta: Array, centroid: Array) -> MatchedWidth:
+        """Return the width of the weight as `at` does, without the tests."""
+        frame = _Frame(forms=sheared_forms(eta, self.weight.frame), shrink=shrink_factor(eta))
+        moments, widths = [], []
+        for rows in blocks_in_cache(self.galaxies.re):
+            block = self.take(rows)
+            f0, shrink = frame.forms.forms[0][rows, :], frame.shrink[rows]
+            view = block._view(f0, shrink, centroid[rows, :])
+            moments.append(self._size_moments(view))
+            widths.append(block._width(moments[-1].t_re, f0, shrink))
+        return self._matched_width(frame, _joined(moments), _joined(widths))
 
     def noise(self, eta: Array, centroid: Array, inverse_power: Array) -> TestNoise:
         """Return the noise of the raw tests, and the flux, at a solution.
@@ -302,11 +319,11 @@ class NullTests:
             block = self.take(rows)
             f0, shrink = frame.forms.forms[0][rows, :], frame.shrink[rows]
             view = block._view(f0, shrink, centroid[rows, :])
-            t_re = self.grid.moments(view.psf_factor * view.re, 0, 2)
-            width = block._width(t_re, f0, shrink)
+            size = self._size_moments(view)
+            width = block._width(size.t_re, f0, shrink)
             gauss = _gauss(view.square, width.width)
             weight = view.psf_factor * gauss
-            moments.append(self._field_moments(view, t_re, gauss, weight))
+            moments.append(self._field_moments(view, size, gauss, weight))
             widths.append(width)
             if inverse_power is not None:
                 shared = int(inverse_power.shape[0]) == 1
@@ -320,12 +337,22 @@ class NullTests:
         factor, slope = self.weight.psf_factor(square, shrink)
         return _View(square=square, re=re, im=im, psf_factor=factor, psf_slope=slope)
 
-    def _field_moments(self, view: _View, t_re: Array, gauss: Array, weight: Array) -> _Moments:
-        moments, slope = self.grid.moments, view.psf_slope * gauss
-        return _Moments(
-            t_re=t_re,
+    def _size_moments(self, view: _View) -> _SizeMoments:
+        moments = self.grid.moments
+        return _SizeMoments(
+            t_re=moments(view.psf_factor * view.re, 0, 2),
             t_im=moments(view.psf_factor * view.im, 1, 3),
             dt_re=moments(view.psf_slope * view.re, 2, 4),
+        )
+
+    def _field_moments(
+        self, view: _View, size: _SizeMoments, gauss: Array, weight: Array
+    ) -> _Moments:
+        moments, slope = self.grid.moments, view.psf_slope * gauss
+        return _Moments(
+            t_re=size.t_re,
+            t_im=size.t_im,
+            dt_re=size.dt_re,
             w_re=moments(weight * view.re, 0, 2, 4),
             w_im=moments(weight * view.im, 1, 3),
             dw_re=moments(slope * view.re, 4),
@@ -361,7 +388,7 @@ class NullTests:
         slope = xp.where(positive, slope, xp.zeros_like(slope))
         return _Width(width=width, slope=slope, at_bound=at_bound)
 
-    def _matched_width(self, frame: _Frame, moments: _Moments, width: _Width) -> MatchedWidth:
+    def _matched_width(self, frame: _Frame, moments: _SizeMoments, width: _Width) -> MatchedWidth:
         """Return the width with its derivatives."""
         xp = array_namespace(t_re=moments.t_re)
         flux, a2 = moments.t_re[:, 0], moments.t_re[:, 1:]
@@ -392,7 +419,7 @@ class NullTests:
         )
 
     def _ln_mean_square_slopes(
-        self, frame: _Frame, moments: _Moments, flux: Array, square: Array
+        self, frame: _Frame, moments: _SizeMoments, flux: Array, square: Array
     ) -> tuple[Array, Array]:
         """Return the derivatives of `ln<|k'|²>` by (eta1, eta2, x0, y0) and by ln s."""
         xp = array_namespace(flux=flux)

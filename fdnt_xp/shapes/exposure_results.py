@@ -46,10 +46,10 @@ class ExposureResult(ObjectShapes):
     Parameters
     ----------
     eta, eta_cov, eg, size, flags, n_iter, status, masked_fraction
-        As in `ShapeResult`, of the object; `size` is the mean over exposures, in the unit of
-        the sky, and `masked_fraction` that of its stamps.
+        As in `ShapeResult`, of the object; `size` is that of the weights of all exposures, in
+        the unit of the sky, and `masked_fraction` the mean of its stamps.
     centroid : array, shape (n_obj, 2)
-        (x, y) on the first of its stamps.
+        (x, y) on the first of its stamps that counts.
     sky_offset : array, shape (n_obj, 2)
         (u, v) of the centroid from the point that is at `origin` on each stamp.
     flux : array, shape (n_obj,)

@@ -75,7 +75,7 @@ class SeenObjects:
         return (xp.abs(centroid[:, 0]) > 0.5 * nx) | (xp.abs(centroid[:, 1]) > 0.5 * ny)
 
     def on_sky(self, shapes: ShapeResult, noise: SolutionNoise) -> ObjectShapes:
-        """Return shapes with lengths on the sky, centroids on the first stamp, and band fluxes.
+        """Return shapes with lengths on the sky, centroids on a stamp, and band fluxes.
 
         Parameters
         ----------
@@ -85,11 +85,6 @@ class SeenObjects:
             Of the stamps.
         """
         xp = array_namespace(unit=self.unit)
-        exposures = self.look.exposures
-        ny, nx = self.stamp_shape
-        like = {"dtype": self.unit.dtype, "device": device_of(self.unit)}
-        middle = xp.asarray([0.5 * (nx - 1), 0.5 * (ny - 1)], **like)
-        on_stamps = by_object(exposures.centroids(shapes.centroid), exposures.n_each)
         flux, snr = self._band_fluxes(shapes, noise)
         total = shapes.snr
         if snr is not None:
@@ -98,7 +93,7 @@ class SeenObjects:
             total = xp.where(xp.any(there, axis=-1), xp.sqrt(xp.sum(squares, axis=-1)), total)
         none = xp.zeros_like(shapes.flags)
         moved = {
-            "centroid": on_stamps[:, 0, :] + middle,
+            "centroid": self._on_first_stamp(shapes.centroid),
             "sky_offset": shapes.centroid * self.unit[:, None],
             "size": shapes.size * self.unit,
             "snr": total,
@@ -110,6 +105,20 @@ class SeenObjects:
             band_flux=flux,
             band_snr=snr,
         )
+
+    def _on_first_stamp(self, offset: Array) -> Array:
+        """Return (x, y) of centroids on the first stamp of each object that counts."""
+        xp = array_namespace(offset=offset)
+        exposures = self.look.exposures
+        ny, nx = self.stamp_shape
+        like = {"dtype": offset.dtype, "device": device_of(offset)}
+        middle = xp.asarray([0.5 * (nx - 1), 0.5 * (ny - 1)], **like)
+        counts = by_object(xp.astype(exposures.factor != 0, xp.int32), exposures.n_each)
+        first = (counts > 0) & (xp.cumulative_sum(counts, axis=1) == 1)
+        places = by_object(exposures.centroids(offset), exposures.n_each)
+        place = xp.sum(xp.where(first[:, :, None], places, xp.zeros_like(places)), axis=1)
+        # Where there is no shape, there is no centroid either.
+        return xp.where(xp.isfinite(offset), place + middle, offset)
 
     def _band_fluxes(
         self, shapes: ShapeResult, noise: SolutionNoise
@@ -198,10 +207,14 @@ def _solved_on(
     start = round_start(objects.look.offset, job.length)
     root = search(tests, start, known, max_iter=max_iter, last_step_free=last_step_free)
     eta, centroid = tests.on_stamps(root.x)
+    stamps, widths = tests.stamps, None
+    if exposures.n_each > 1 and tests.fixed_width is None:
+        widths = stamps.widths(eta, centroid)
+        stamps = tests.of_one_size(widths)
     noise = objects.sources.noise(
-        tests.stamps, eta, centroid, inverse_transfer, n_at_once=objects.n_at_once
+        stamps, eta, centroid, inverse_transfer, n_at_once=objects.n_at_once
     )
-    summed, matched = tests.summed(noise.tests, noise.matched)
+    summed, matched = tests.summed(noise.tests, noise.matched if widths is None else widths)
     if last_step_free:
         root = looked_at(root, *tests.scaled(root.x[:, :2], summed, matched))
     flux, variance = _mean_flux(exposures, noise, objects.look.flux_share)

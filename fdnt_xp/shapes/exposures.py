@@ -52,10 +52,10 @@ def measure_exposures(
     """Measure the shape of each object from all of its exposures together.
 
     The null tests of an object are the sums of those of its stamps, weighted by (S/N)², with
-    one shape and one centroid on the sky; each stamp has its own PSF, pixels and noise, and
-    the size of its weight follows its own profile, as bands need not share one. Nothing
-    raises for the sake of a stamp or an object: stamps that cannot be used are left out and
-    flagged, objects without a shape are NaN.
+    one shape, one centroid and one size of the weights on the sky; each stamp has its own PSF,
+    pixels and noise, and bands need not show one profile. Nothing raises for the sake of a
+    stamp or an object: stamps that cannot be used are left out and flagged, objects without
+    a shape are NaN.
 
     Parameters
     ----------
@@ -88,9 +88,8 @@ def measure_exposures(
     order : int
         As `measure_shapes` has it.
     size : float, optional
-        Fixes the size sigma of the weights, on the sky. By default that of each stamp is
-        matched to its own galaxy, which costs a fourth of the accuracy where exposures have
-        an S/N of 8, and little above 12.
+        Fixes the size sigma of the weights, on the sky. By default it is the mean of those
+        that match the galaxy on each stamp.
     padding, max_iter
         As `measure_shapes` has them.
     chunk_size : int, optional
@@ -131,8 +130,8 @@ def measure_exposures(
     ...     object_index=np.array([0, 0]),
     ...     origin=np.array([[24.0, 24.0], [26.0, 24.0]]),
     ... )
-    >>> shapes.e.round(6)  # (14 - 8)/(14 + 8)
-    array([[0.272727, 0.      ]])
+    >>> shapes.e[:, 0].round(6)  # (14 - 8)/(14 + 8)
+    array([0.272727])
     >>> shapes.n_used
     array([2], dtype=int32)
     """

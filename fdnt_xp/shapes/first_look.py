@@ -14,7 +14,7 @@ from typing import Final
 
 from fdnt_xp.arrays import Array, array_namespace, device_of
 from fdnt_xp.flags import Flag
-from fdnt_xp.nulltests.exposures import Exposures, by_object, spread_over_stamps
+from fdnt_xp.nulltests.exposures import Exposures, ExposureTests, by_object, spread_over_stamps
 from fdnt_xp.nulltests.scaled import over_scale
 from fdnt_xp.nulltests.tests import NullTests
 from fdnt_xp.shapes.centroid import DipoleTests, find_centroid
@@ -125,7 +125,11 @@ def look(
 
     centroid = first.centroids(offset)
     inverse_power = xp.real(inverse_transfer) ** 2 + xp.imag(inverse_transfer) ** 2
-    seen = tests.noise(xp.zeros_like(centroid), centroid, inverse_power)
+    eta = xp.zeros_like(centroid)
+    if n_each > 1 and tests.fixed_width is None:
+        summed = ExposureTests(stamps=tests, exposures=first)
+        tests = summed.of_one_size(tests.widths(eta, centroid))
+    seen = tests.noise(eta, centroid, inverse_power)
     ny, nx = tests.grid.shape
     per_mode = variance * float(ny * nx)
     error = xp.sqrt(seen.scale_variance * per_mode)
