@@ -21,6 +21,7 @@ from fdnt_xp.data.catalog import check_catalog
 from fdnt_xp.data.images import read_image
 from fdnt_xp.data.ivar import IvarSource
 from fdnt_xp.data.provenance import Value, provenance
+from fdnt_xp.data.row_batches import check_text
 from fdnt_xp.data.stamps import StampSource
 from fdnt_xp.errors import FdntValueError
 from fdnt_xp.shapes.methods import shape_method
@@ -72,6 +73,7 @@ def measure_files(
     check_catalog(output, overwrite=overwrite)
     _check(inputs, settings)
     plan, work = _make_plan(inputs, settings)
+    check_text(output, work.source.ids, "id")
     run = PartsRun(
         output=Path(output),
         n_gal=work.source.n_gal,

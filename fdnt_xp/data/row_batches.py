@@ -18,6 +18,7 @@ import numpy as np
 from astropy.io import fits
 from astropy.table import Table
 from astropy.table.meta import get_yaml_from_table
+from numpy.typing import NDArray
 
 from fdnt_xp.data.files import new_file
 from fdnt_xp.data.provenance import COMMENTS, Value
@@ -83,6 +84,21 @@ def new_catalog(
 def check_suffix(path: str | os.PathLike[str]) -> None:
     """Raise if no catalog can have this name, or not without a package that is missing."""
     _kind_of(path)
+
+
+def check_text(path: str | os.PathLike[str], values: NDArray[Any], name: str) -> None:
+    """Raise `CatalogError` if a column of text cannot go batch by batch into a file of this name.
+
+    FITS holds ASCII alone, and HDF5 text of as many bytes as that of the first rows.
+    """
+    if values.dtype.kind != "U" or Path(path).suffix.lower() in (".ecsv", ".parquet"):
+        return
+    foreign = next((text for text in values.tolist() if not text.isascii()), None)
+    if foreign is not None:
+        raise CatalogError(
+            f"the {name} {foreign!r} is not ASCII, which {path} cannot hold; "
+            "choose .ecsv or .parquet"
+        )
 
 
 class RowFile(Protocol):

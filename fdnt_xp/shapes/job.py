@@ -182,9 +182,9 @@ def check_options(*, size: float | None, padding: int, chunk_size: int | None) -
 
 def check_count(name: str, value: int, least: int) -> None:
     """Refuse what is not an integer from `least` up."""
-    if not isinstance(value, numbers.Integral):
-        raise FdntTypeError(f"{name} must be a whole number, not {value!r}")
-    if value < least:
+    if not isinstance(value, numbers.Real) or (isinstance(value, float) and value % 1 == 0):
+        raise FdntTypeError(f"{name} must be an integer, not {value!r}")
+    if not isinstance(value, numbers.Integral) or value < least:
         raise RangeError(name, value, least, None)
 
 

@@ -44,8 +44,8 @@ _FARTHEST: Final = 1e4
 
 def check_order(order: int) -> None:
     """Raise `FdntTypeError` or `RangeError` if there is no basis of this order."""
-    if not isinstance(order, numbers.Real):
-        raise FdntTypeError(f"order must be a whole number, not {order!r}")
+    if not isinstance(order, numbers.Real) or (isinstance(order, float) and order % 1 == 0):
+        raise FdntTypeError(f"order must be an integer, not {order!r}")
     if not (isinstance(order, numbers.Integral) and 0 <= order <= MAX_ORDER):
         raise RangeError("order", order, 0, MAX_ORDER)
 
