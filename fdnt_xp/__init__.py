@@ -7,6 +7,8 @@ from fdnt_xp.data.noise_power import measure_noise_power as measure_noise_power
 from fdnt_xp.data.ring import RingResult as RingResult
 from fdnt_xp.data.ring import ring_test as ring_test
 from fdnt_xp.fourier.psf import Psf as Psf
+from fdnt_xp.shapes.exposure_results import ExposureResult as ExposureResult
+from fdnt_xp.shapes.exposures import measure_exposures as measure_exposures
 from fdnt_xp.shapes.measure import measure_shapes as measure_shapes
 from fdnt_xp.shapes.results import ShapeResult as ShapeResult
 from fdnt_xp.shears.cuts import Cut as Cut
@@ -22,12 +24,14 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Cut",
+    "ExposureResult",
     "Psf",
     "ResponseResult",
     "RingResult",
     "ShapeResult",
     "ShearEstimate",
     "__version__",
+    "measure_exposures",
     "measure_noise_power",
     "measure_responses",
     "measure_shapes",

@@ -55,6 +55,10 @@ class Flag(IntFlag):
     """Missing pixels were filled from the others."""
     BAD_JACOBIAN = 1 << 24
     """The galaxy's own Jacobian is not finite, or singular."""
+    NO_EXPOSURE = 1 << 25
+    """Of many exposures there is none, or none that can be used."""
+    BAD_NOISE = 1 << 26
+    """The exposure's own noise variance is not finite and positive: it has no weight."""
 
 
 INFORMATION: Final = (
@@ -104,4 +108,6 @@ _TEXT: Final[dict[str, str]] = {
     "MASKED": "pixels missing",
     "FILLED": "missing pixels filled from the others",
     "BAD_JACOBIAN": "Jacobian singular or not finite",
+    "NO_EXPOSURE": "no usable exposure",
+    "BAD_NOISE": "noise variance not finite and positive",
 }

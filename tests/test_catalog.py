@@ -10,13 +10,13 @@ from astropy.io import fits
 from astropy.table import Table
 
 import fdnt_xp
-from fdnt_xp.data import catalog
+from fdnt_xp.data import row_batches
 from fdnt_xp.data.catalog import check_catalog, read_catalog, write_catalog
-from fdnt_xp.data.provenance import COMMENTS, provenance
-from fdnt_xp.errors import CatalogError, MissingExtraError
+from fdnt_xp.data.provenance import COMMENTS, SCHEMA, provenance
+from fdnt_xp.errors import CatalogError, FdntWarning, MissingExtraError
 from fdnt_xp.flags import Flag
 
-SUFFIXES = [".fits", ".fit", ".ecsv", ".parquet"]
+SUFFIXES = [".fits", ".fit", ".ecsv", ".parquet", ".hdf5", ".h5"]
 
 
 @pytest.fixture
@@ -95,6 +95,14 @@ def test_provenance():
         provenance(no_such_fact=1)
 
 
+def test_columns_of_a_later_version_are_warned_of(table, tmp_path):
+    assert table.meta["SCHEMA"] == SCHEMA
+    table.meta["SCHEMA"] = SCHEMA + 1
+    write_catalog(table, tmp_path / "catalog.fits")
+    with pytest.warns(FdntWarning, match=f"columns of version {SCHEMA + 1}"):
+        assert len(read_catalog(tmp_path / "catalog.fits")) == len(table)
+
+
 @pytest.mark.parametrize("keyword", COMMENTS)
 def test_keywords_fit_a_fits_header(keyword):
     assert len(keyword) <= 8
@@ -120,14 +128,12 @@ def test_an_existing_file_is_kept(suffix, table, tmp_path):
 @pytest.mark.parametrize("suffix", SUFFIXES)
 @pytest.mark.parametrize("error", [OSError(28, "No space left"), KeyboardInterrupt()])
 def test_a_writer_that_fails_midway_leaves_nothing(suffix, error, table, tmp_path, monkeypatch):
-    write, read = catalog._FORMATS[suffix]
+    class WritesHalf(row_batches._KINDS[suffix]):
+        def append(self, table):
+            super().append(table)
+            raise error
 
-    def write_half(table, path):
-        write(table, path)
-        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-        raise error
-
-    monkeypatch.setitem(catalog._FORMATS, suffix, (write_half, read))
+    monkeypatch.setitem(row_batches._KINDS, suffix, WritesHalf)
     path = tmp_path / f"catalog{suffix}"
     with pytest.raises(CatalogError if isinstance(error, OSError) else KeyboardInterrupt):
         write_catalog(table, path)
@@ -137,7 +143,9 @@ def test_a_writer_that_fails_midway_leaves_nothing(suffix, error, table, tmp_pat
 @pytest.mark.parametrize("name", ["catalog.txt", "catalog", "catalog.fits.gz"])
 @pytest.mark.parametrize("function", [read_catalog, check_catalog])
 def test_unknown_suffix(name, function, tmp_path):
-    with pytest.raises(CatalogError, match=r"known are \.fits, \.fit, \.ecsv, \.parquet"):
+    with pytest.raises(
+        CatalogError, match=r"known are \.fits, \.fit, \.ecsv, \.parquet, \.hdf5, \.h5"
+    ):
         function(tmp_path / name)
 
 
@@ -163,7 +171,9 @@ def test_files_that_cannot_be_read(suffix, table, tmp_path):
             read_catalog(path)
 
 
-def test_parquet_names_its_extra(table, tmp_path, monkeypatch):
+@pytest.mark.parametrize("suffix", [".parquet", ".hdf5", ".h5"])
+def test_formats_name_their_extras(suffix, table, tmp_path, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
-    with pytest.raises(MissingExtraError, match=r"fdnt-xp\[parquet\]"):
-        write_catalog(table, tmp_path / "catalog.parquet")
+    extra = "parquet" if suffix == ".parquet" else "hdf5"
+    with pytest.raises(MissingExtraError, match=rf"fdnt-xp\[{extra}\]"):
+        write_catalog(table, tmp_path / f"catalog{suffix}")

@@ -16,11 +16,12 @@ from click.testing import CliRunner
 
 import fdnt_xp
 from conftest import selected_backends
-from fdnt_xp.app import measure as measure_module
+from fdnt_xp.app import measure_run
 from fdnt_xp.app.backends import load_backend
 from fdnt_xp.app.cli import main
 from fdnt_xp.app.demo import shear_lines
-from fdnt_xp.app.runner import find_noise, measure_source
+from fdnt_xp.app.noise import find_noise
+from fdnt_xp.app.runner import measure_source
 from fdnt_xp.data.catalog import read_catalog, write_catalog
 from fdnt_xp.data.simulate import great08_image
 from fdnt_xp.data.stamps import cube_stamps, grid_stamps
@@ -254,7 +255,7 @@ def test_what_cannot_be_measured(arguments, message, folder, drawn):
     ],
 )
 def test_outputs_are_refused_before_any_work(output, message, folder, monkeypatch):
-    monkeypatch.setattr(measure_module, "measure_source", pytest.fail)
+    monkeypatch.setattr(measure_run, "measure_rows", pytest.fail)
     (folder / "old.fits").write_text("old")
     assert message in run(*GRID, "-o", output, code=1)
     assert (folder / "old.fits").read_text() == "old"
@@ -282,7 +283,7 @@ def test_an_interrupt_leaves_nothing_and_says_so(number, folder, monkeypatch):
         signal.raise_signal(number)
 
     before = sorted(folder.iterdir())
-    monkeypatch.setattr(measure_module, "measure_source", interrupt)
+    monkeypatch.setattr(measure_run, "measure_rows", interrupt)
     output = run(*GRID, "-o", "catalog.fits", code=130)
     assert output == "Interrupted: nothing unfinished was left behind.\n"
     assert sorted(folder.iterdir()) == before
@@ -449,7 +450,7 @@ def test_warnings_of_other_libraries_are_not_shown(folder, monkeypatch):
         warnings.warn("about a galaxy", FdntWarning, stacklevel=1)
         raise FdntValueError("the end")
 
-    monkeypatch.setattr(measure_module, "measure_source", warn)
+    monkeypatch.setattr(measure_run, "measure_rows", warn)
     with warnings.catch_warnings():
         warnings.simplefilter("default")
         output = run(*GRID, "-o", "catalog.fits", code=1)

@@ -23,7 +23,7 @@ from conftest import selected_backends
 from fdnt_xp.app import great08_run
 from fdnt_xp.app.great08_measure import ESTIMATORS, MeasureOptions, SetResult, SetShear
 from fdnt_xp.app.great08_run import measure_challenge
-from fdnt_xp.app.runner import find_noise
+from fdnt_xp.app.noise import find_noise
 from fdnt_xp.data.catalog import read_catalog
 from fdnt_xp.data.images import write_image
 from fdnt_xp.data.stamps import cube_stamps
@@ -459,25 +459,24 @@ def test_results_come_back_from_json():
 _HOLD = """
 import sys, time
 from pathlib import Path
-from astropy.io import fits
 from fdnt_xp.app.cli import main
+from fdnt_xp.data.row_batches import _FitsFile
 
 def hold():
     Path("held").touch()
     time.sleep(60)
 
-def writeto(self, path, write=fits.HDUList.writeto):
-    if "set0002" in str(path) and sys.argv[1] == "catalog":
-        Path(path).write_bytes(b"SIMPLE  =")
+def append(self, table, append=_FitsFile.append):
+    append(self, table)
+    if "set0002" in str(self._file.name) and sys.argv[1] == "catalog":
         hold()
-    write(self, path)
 
 def replace(self, target, replace=Path.replace):
     if str(target).endswith("sets/set0002.json") and sys.argv[1] == "result":
         hold()
     return replace(self, target)
 
-fits.HDUList.writeto, Path.replace = writeto, replace
+_FitsFile.append, Path.replace = append, replace
 main(sys.argv[2:])
 """
 

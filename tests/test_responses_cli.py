@@ -15,15 +15,16 @@ import fdnt_xp as fx
 from conftest import selected_backends
 from fdnt_xp.app.backends import load_backend
 from fdnt_xp.app.cli import main
+from fdnt_xp.app.noise import Noise, find_noise
 from fdnt_xp.app.plots import plot_catalog
 from fdnt_xp.app.responses import galaxy_numbers, measure_source_responses
-from fdnt_xp.app.runner import Noise, find_noise
 from fdnt_xp.app.shear import catalog_shear, parse_cut
 from fdnt_xp.data.catalog import read_catalog, write_catalog
 from fdnt_xp.data.simulate import great08_image
 from fdnt_xp.data.stamps import cube_stamps, grid_stamps
 from fdnt_xp.errors import CatalogError, FdntValueError, FdntWarning, ShapeMismatchError
 from fdnt_xp.flags import Flag
+from fdnt_xp.shapes.results import PSF_COLUMNS
 from fdnt_xp.shears.responses import COLUMNS
 
 pytest.importorskip("galsim")
@@ -76,7 +77,8 @@ def test_image_to_shear(suffix, folder, drawn):
     assert f"measured   {N_GAL} of {N_GAL} galaxies (100.00%)" in output
     table = read_catalog(f"catalog{suffix}")
     names = ["id", "x", "y", "x_image", "y_image"]
-    assert table.colnames == names + [name for name in COLUMNS if name not in ("x", "y")]
+    measured = [name for name in COLUMNS if name not in ("x", "y")]
+    assert table.colnames == [*names, *measured, *PSF_COLUMNS]
     assert all(column.description for column in table.itercols())
     assert table["size_1p"].unit == "pix"
     np.testing.assert_allclose(table["x_image"], drawn.truth["x"], atol=0.5)

@@ -10,17 +10,20 @@ import click
 
 import fdnt_xp
 from fdnt_xp.app.check import CheckOptions, run_check
-from fdnt_xp.app.command import HOW, OVERWRITE, WHERE, Command
+from fdnt_xp.app.command import HOW, JOBS, OVERWRITE, WHERE, Command
 from fdnt_xp.app.demo import Field, run_demo
+from fdnt_xp.app.exposures_command import measure_exposures_command
 from fdnt_xp.app.gradient_figure import GradientFigure, draw_gradient_figure
 from fdnt_xp.app.great08_commands import great08
-from fdnt_xp.app.measure import Inputs, Settings, measure_files
+from fdnt_xp.app.measure import Inputs, Settings
+from fdnt_xp.app.measure_run import measure_files
 from fdnt_xp.app.plots import check_figure, plot_catalog, save_figure
 from fdnt_xp.app.ring import RingOptions, run_ring
 from fdnt_xp.app.shear import catalog_shear, report_lines
 from fdnt_xp.app.summary import summary_lines
 from fdnt_xp.app.underfitting_figure import UnderfittingFigure, draw_underfitting_figure
-from fdnt_xp.data.catalog import check_catalog, read_catalog, write_catalog
+from fdnt_xp.app.workers import warn_of_too_many
+from fdnt_xp.data.catalog import read_catalog
 from fdnt_xp.data.noise_estimators import ESTIMATORS
 from fdnt_xp.data.versions import KINDS
 
@@ -33,7 +36,7 @@ def main() -> None:
 
 @main.command(cls=Command)
 @click.argument("image")
-@click.option("--psf", required=True, metavar="FITS", help="Image of a star, or a cube of them.")
+@click.option("--psf", required=True, metavar="FILE", help="Image of a star, or a cube of them.")
 @click.option("--cell", type=int, metavar="N", help="The image is a grid of N x N pixel cells.")
 @click.option("--positions", metavar="TABLE", help="Positions of the galaxies on the image.")
 @click.option("--stamp-size", type=int, metavar="N", help="Pixels on a side, with --positions.")
@@ -51,7 +54,7 @@ def main() -> None:
     "--output",
     required=True,
     metavar="CATALOG",
-    help="Catalog to write: .fits, .ecsv or .parquet.",
+    help="Catalog to write: .fits, .ecsv, .parquet or .hdf5.",
 )
 @click.option(
     "--method",
@@ -73,17 +76,18 @@ def main() -> None:
 )
 @click.option(
     "--noise-image",
-    metavar="FITS",
+    metavar="FILE",
     help="Blank sky to measure the noise on: an image, or a cube of stamps.",
 )
 @click.option(
-    "--mask", metavar="FITS", help="Of the shape of IMAGE: not 0 where a pixel is missing."
+    "--mask", metavar="FILE", help="Of the shape of IMAGE: not 0 where a pixel is missing."
 )
 @click.option(
     "--weight",
-    metavar="FITS",
+    metavar="FILE",
     help="Of the shape of IMAGE: the inverse variance of each pixel, 0 where it is missing.",
 )
+@JOBS
 @HOW
 @OVERWRITE
 def measure(
@@ -99,14 +103,19 @@ def measure(
     noise_image: str | None,
     mask: str | None,
     weight: str | None,
+    jobs: int,
+    scheduler: str | None,
     overwrite: bool,
     **how: Any,
 ) -> None:
     """Measure the galaxies of IMAGE and write a catalog.
 
-    IMAGE is a FITS image that is a grid of cells (--cell), a FITS image with a table of
-    positions (--positions, --stamp-size), or a FITS cube of stamps. FILE.fits[EXT] names an
-    extension.
+    IMAGE is an image that is a grid of cells (--cell), an image with a table of positions
+    (--positions, --stamp-size), or a cube of stamps: FITS or HDF5. FILE.fits[EXT] names an
+    extension, FILE.h5::DATASET a dataset.
+
+    A command that was interrupted, or killed, goes on where it ended if it is given again:
+    what is finished is in the folder CATALOG.parts, which is removed at the end.
     """
     inputs = Inputs(
         image=image,
@@ -122,12 +131,12 @@ def measure(
         weight=weight,
     )
     settings = Settings(**how)
-    inputs.refuse_as_output(output)
-    check_catalog(output, overwrite=overwrite)
-    table, seconds = measure_files(inputs, settings)
-    write_catalog(table, output, overwrite=overwrite)
+    warn_of_too_many(jobs)
+    report = measure_files(
+        inputs, settings, output, overwrite=overwrite, jobs=jobs, scheduler=scheduler
+    )
     if not settings.quiet:
-        for line in summary_lines(table, seconds):
+        for line in summary_lines(report.kept, report.seconds, report.n_before):
             click.echo(line)
         click.echo(f"written    {output}")
 
@@ -332,6 +341,7 @@ def check(output: str | None, figure: str | None, overwrite: bool, **options: An
 
 
 main.add_command(great08)
+main.add_command(measure_exposures_command)
 
 
 @main.group(name="figure")

@@ -31,8 +31,9 @@ class Command(click.Command):
                 return super().invoke(ctx)
         except FdntError as error:
             raise click.ClickException(" ".join(str(error).split())) from error
-        except KeyboardInterrupt:
-            click.echo("Interrupted: nothing unfinished was left behind.", err=True)
+        except KeyboardInterrupt as interrupt:
+            kept = str(interrupt) or "nothing unfinished was left behind"
+            click.echo(f"Interrupted: {kept}.", err=True)
             ctx.exit(_INTERRUPTED)
         finally:
             signal.signal(signal.SIGTERM, previous)
@@ -112,5 +113,20 @@ HOW = options(
         help="Galaxies at a time; bounds the memory. [default: 256, on a GPU 8192]",
     ),
     click.option("-q", "--quiet", is_flag=True, help="No progress bar and no summary."),
+)
+JOBS = options(
+    click.option(
+        "--jobs",
+        type=click.IntRange(min=1),
+        default=1,
+        show_default=True,
+        metavar="N",
+        help="Processes, each with one thread.",
+    ),
+    click.option(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="Let the workers of a Dask cluster do it: tcp://host:8786.",
+    ),
 )
 OVERWRITE = click.option("--overwrite", is_flag=True, help="Replace files that exist.")

@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fdnt_xp.app.measure import Inputs, Settings, measure_files
+from fdnt_xp.app.measure import Inputs, Settings
+from fdnt_xp.app.measure_run import measure_files
 from fdnt_xp.app.plots import plot_catalog, save_figure
 from fdnt_xp.app.summary import format_measured, measured_rows, summary_lines
-from fdnt_xp.data.catalog import write_catalog
+from fdnt_xp.data.catalog import read_catalog, write_catalog
 from fdnt_xp.data.files import check_writable, make_folder
 from fdnt_xp.data.images import write_image
 from fdnt_xp.data.provenance import provenance
@@ -99,8 +100,9 @@ def run_demo(
             # Only the wings of the galaxies are on the borders.
             settings = replace(settings, noise_variance=NOISE_SIGMA**2)
     say(f"measuring  {inputs.image}")
-    table, seconds = measure_files(inputs, settings)
-    write_catalog(table, folder / "catalog.fits", overwrite=overwrite)
+    catalog = folder / "catalog.fits"
+    seconds = measure_files(inputs, settings, str(catalog), overwrite=overwrite).seconds
+    table = read_catalog(catalog)
     figure = plot_catalog(table, Path(inputs.image).name)
     save_figure(figure, folder / "catalog.png", overwrite=overwrite)
     for line in summary_lines(table, seconds):

@@ -11,13 +11,14 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 import fdnt_xp.peers  # noqa: F401  gives its methods their names
 from fdnt_xp.app.backends import Backend, load_backend
-from fdnt_xp.app.runner import Noise, find_noise, measure_source
+from fdnt_xp.app.noise import Noise, find_noise
+from fdnt_xp.app.runner import measure_source
 from fdnt_xp.app.summary import measured_rows
 from fdnt_xp.arrays import Array, array_namespace, device_of
-from fdnt_xp.data.images import Pixels
 from fdnt_xp.data.provenance import Value, provenance
 from fdnt_xp.data.stamps import StampSource
 from fdnt_xp.errors import FdntValueError, FdntWarning, RangeError
@@ -252,7 +253,7 @@ class _Sample:
 
     number: int
     source: StampSource
-    psf_pixels: Pixels
+    psf_pixels: NDArray[Any]
     oversampling: float
     noise_variance: float | None
     catalog: Table

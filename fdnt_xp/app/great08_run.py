@@ -10,7 +10,6 @@ The folder, `OUT` in the documentation, says at any time how far a run has come:
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 import time
@@ -24,21 +23,19 @@ from typing import Any, Final
 
 from tqdm import tqdm
 
-import fdnt_xp
 from fdnt_xp.app.backends import load_backend
 from fdnt_xp.app.great08_measure import MeasureOptions, SetResult, measure_set
 from fdnt_xp.app.numbers import write_json
+from fdnt_xp.app.resume import begin_run, read_json, tidy
 from fdnt_xp.app.workers import Failure, open_workers
 from fdnt_xp.data.catalog import write_catalog
 from fdnt_xp.data.files import make_folder
-from fdnt_xp.data.provenance import provenance
 from fdnt_xp.errors import CatalogError, FdntError, FdntWarning
 from fdnt_xp.great08.challenge import Challenge, ChallengeSet, read_challenge, set_name
 from fdnt_xp.great08.submission import submission_table, write_submission, write_text_submission
 
 SUBMISSION: Final = "submission.ecsv"
 _UNFINISHED: Final = (
-    ".run-*.json",
     ".submission-*.ecsv",
     "catalogs/.set*-*.fits",
     "sets/.set*-*.json",
@@ -143,7 +140,7 @@ def measure_challenge(
                         _pass_on(result)
                     bar.update()
         finally:
-            _tidy(folder)
+            tidy(folder, _UNFINISHED)
     ordered = sorted(finished.values(), key=lambda result: result.number)
     _write_submissions(ordered, options, folder)
     return MeasureReport(
@@ -216,45 +213,16 @@ def _facts(challenge: Challenge, options: MeasureOptions, cell: int | None) -> d
 
 def _begin(folder: Path, facts: dict[str, Any]) -> None:
     """Make the folder of a run, or see that it is one that can be resumed."""
-    path = folder / "run.json"
-    if path.is_file():
-        _refuse_others(folder, _read_json(path), facts)
-        _tidy(folder)
-    else:
-        if folder.is_dir() and any(not file.name.startswith(".run-") for file in folder.iterdir()):
-            raise CatalogError(
-                f"{folder} is not empty, and no run of great08 measure is in it: it has no "
-                "run.json; choose another folder"
-            )
-        make_folder(folder)
-        write_json({"options": facts, "begun": provenance()}, str(path), overwrite=False)
+    begin_run(
+        folder,
+        facts,
+        command="great08 measure",
+        remedy="choose another folder",
+        shown={"directory": "DIR"},
+        unfinished=_UNFINISHED,
+    )
     for name in ("catalogs", "sets"):
         make_folder(folder / name)
-
-
-def _refuse_others(folder: Path, run: dict[str, Any], facts: dict[str, Any]) -> None:
-    """Raise `CatalogError` if a run had other options; warn if it was another version's."""
-    if not {"options", "begun"} <= set(run):
-        raise CatalogError(f"{folder / 'run.json'} is not that of a run of great08 measure")
-    for name, now in facts.items():
-        then = run["options"].get(name)
-        if then != now:
-            option = "DIR" if name == "directory" else f"--{name.replace('_', '-')}"
-            raise CatalogError(
-                f"{folder} holds a run with {option} {_shown(then)}, and this has "
-                f"{_shown(now)}: give the same options, or another folder"
-            )
-    version = run["begun"]["FDNTVER"]
-    if version != fdnt_xp.__version__:
-        warnings.warn(
-            f"{folder} was begun by fdnt_xp {version}, and is continued by {fdnt_xp.__version__}",
-            FdntWarning,
-            stacklevel=2,
-        )
-
-
-def _shown(value: Any) -> str:
-    return "not given" if value is None else str(value)
 
 
 def _read_result(folder: Path, one: ChallengeSet) -> SetResult | None:
@@ -263,23 +231,13 @@ def _read_result(folder: Path, one: ChallengeSet) -> SetResult | None:
     if not path.exists():
         return None
     try:
-        return SetResult.from_dict(_read_json(path))
+        return SetResult.from_dict(read_json(path))
     except (KeyError, TypeError) as error:
         raise CatalogError(f"{path} is not what was written: remove it") from error
 
 
 def _result_path(folder: Path, one: ChallengeSet) -> Path:
     return folder / "sets" / f"{one.name}.json"
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise CatalogError(f"cannot read {path}: {error}") from error
-    if not isinstance(content, dict):
-        raise CatalogError(f"{path} is not what was written: remove it")
-    return content
 
 
 def _unreadable(challenge: Challenge) -> dict[str, str]:
@@ -300,10 +258,3 @@ def _write_submissions(results: list[SetResult], options: MeasureOptions, folder
     if results:
         for name in options.estimators:
             write_text_submission(table, name, folder / f"{name}.txt", overwrite=True)
-
-
-def _tidy(folder: Path) -> None:
-    """Remove files that a process which was killed had begun to write."""
-    for pattern in _UNFINISHED:
-        for file in folder.glob(pattern):
-            file.unlink(missing_ok=True)

@@ -1,26 +1,15 @@
-"""What `fdnt-xp measure` does, between its options and its last line."""
+"""What `fdnt-xp measure` is given: files, and how to measure what is in them."""
 
 from __future__ import annotations
 
-import time
-from dataclasses import dataclass
+import os
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-import fdnt_xp.peers  # noqa: F401  gives its methods their names
-from fdnt_xp.app.backends import Backend, load_backend
-from fdnt_xp.app.responses import measure_source_responses
-from fdnt_xp.app.runner import Noise, find_noise, measure_source
-from fdnt_xp.data.images import Pixels, read_image
-from fdnt_xp.data.ivar import IvarSource
-from fdnt_xp.data.provenance import Value, provenance
+from fdnt_xp.data.images import image_file, read_image
 from fdnt_xp.data.stamps import StampSource, cube_stamps, grid_stamps, position_stamps
 from fdnt_xp.data.tables import read_positions
 from fdnt_xp.errors import CatalogError, FdntValueError
-from fdnt_xp.shapes.methods import shape_method
-
-if TYPE_CHECKING:
-    from astropy.table import Table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,10 +58,21 @@ class Inputs:
 
     def refuse_as_output(self, output: str) -> None:
         """Raise `CatalogError` if the output would replace one of the inputs."""
-        maps = (self.noise_image, self.mask, self.weight)
-        for path in (self.image, self.psf, self.positions, *maps):
-            if path is not None and Path(path).resolve() == Path(output).resolve():
-                raise CatalogError(f"{output} is an input; choose another name for the output")
+        if Path(output).resolve() in (path.resolve() for path in self.files()):
+            raise CatalogError(f"{output} is an input; choose another name for the output")
+
+    def files(self) -> tuple[Path, ...]:
+        """Return the files that are read, without the names of extensions and datasets."""
+        return tuple(image_file(getattr(self, name)) for name in self._given())
+
+    def absolute(self) -> Inputs:
+        """Return the same with full names, for processes that are elsewhere."""
+        named = {name: os.path.abspath(getattr(self, name)) for name in self._given()}  # noqa: PTH100  not every name is a file's
+        return replace(self, **named)
+
+    def _given(self) -> list[str]:
+        names = ("image", "psf", "positions", "noise_image", "mask", "weight")
+        return [name for name in names if getattr(self, name) is not None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,94 +146,8 @@ def open_source(inputs: Inputs) -> StampSource:
     return cube_stamps(pixels)
 
 
-def measure_files(inputs: Inputs, settings: Settings) -> tuple[Table, float]:
-    """Measure an image; return the catalog with its provenance, and the seconds it took."""
-    backend = load_backend(settings.backend, settings.device, settings.dtype)
-    method = shape_method(settings.method)
-    if settings.responses and settings.method != "fdnt-ft":
-        raise FdntValueError("--method chooses how shapes are measured, not --responses")
-    if settings.responses and (inputs.mask or inputs.weight):
-        raise FdntValueError("--mask and --weight are for shapes, not for --responses")
-    source = open_source(inputs)
-    mask = _open_beside(source, inputs.mask, "mask")
-    weight = _open_beside(source, inputs.weight, "weight map")
-    psf_pixels: Pixels = read_image(inputs.psf, ndim=(2, 3), what="PSF image")
-    blank = None
-    if inputs.noise_image is not None:
-        blank = read_image(inputs.noise_image, ndim=(2, 3), what="noise image")
-    noise = find_noise(source, settings.noise_variance, blank, mask=mask, mapped=weight is not None)
-    ivar = None
-    if mask is not None or weight is not None:
-        ivar = IvarSource(mask=mask, weight=weight, variance=noise.variance)
-    start = time.perf_counter()
-    if settings.responses:
-        table = measure_source_responses(
-            source,
-            psf_pixels,
-            backend=backend,
-            noise=noise,
-            oversampling=settings.oversampling,
-            size=settings.size,
-            seed=settings.seed,
-            chunk=settings.chunk,
-            quiet=settings.quiet,
-        )
-    else:
-        table = measure_source(
-            source,
-            psf_pixels,
-            backend=backend,
-            method=method,
-            noise_variance=noise.variance,
-            ivar=ivar,
-            oversampling=settings.oversampling,
-            size=settings.size,
-            chunk=settings.chunk,
-            quiet=settings.quiet,
-        )
-    seconds = time.perf_counter() - start
-    table.meta = _facts(inputs, settings, backend, noise, table.meta.get("RSTEP"))
-    return table, seconds
-
-
-def _open_beside(source: StampSource, path: str | None, what: str) -> StampSource | None:
+def open_beside(source: StampSource, path: str | None, what: str) -> StampSource | None:
     """Open a map of the shape of the image."""
     if path is None:
         return None
     return source.beside(read_image(path, ndim=(2, 3), what=what), what)
-
-
-def _facts(
-    inputs: Inputs, settings: Settings, backend: Backend, noise: Noise, step: float | None
-) -> dict[str, Value]:
-    """Return the header of the catalog."""
-    positions = inputs.layout == "positions"
-    return provenance(
-        method="responses" if settings.responses else settings.method,
-        backend=backend.library,
-        libver=backend.version,
-        device=backend.device,
-        dtype=backend.dtype,
-        image=inputs.image,
-        psfimage=inputs.psf,
-        layout=inputs.layout,
-        cell=inputs.cell,
-        poscat=inputs.positions,
-        stampsiz=inputs.stamp_size,
-        xcolumn=inputs.x_column if positions else None,
-        ycolumn=inputs.y_column if positions else None,
-        origin=inputs.origin if positions else None,
-        oversamp=settings.oversampling,
-        noisevar=noise.variance,
-        noiseerr=noise.relative_err,
-        noisesrc=noise.origin,
-        noiseimg=inputs.noise_image,
-        maskimg=inputs.mask,
-        ivarimg=inputs.weight,
-        noisecor=noise.power is not None if settings.responses else None,
-        bordlvl=noise.border.level if noise.border else None,
-        wtsize=settings.size,
-        chunk=settings.chunk,
-        seed=settings.seed if settings.responses else None,
-        rstep=step,
-    )

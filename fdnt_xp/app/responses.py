@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdnt_xp.app.backends import Backend
-from fdnt_xp.app.runner import ChunkPsfs, Noise, measure_chunks
+from fdnt_xp.app.noise import Noise
+from fdnt_xp.app.runner import ChunkPsfs, MeasureChunk, measure_chunks
 from fdnt_xp.arrays import Array, array_namespace, device_of
 from fdnt_xp.data.images import Pixels
 from fdnt_xp.data.stamps import StampChunk, StampSource
@@ -58,13 +59,34 @@ def measure_source_responses(
     FdntValueError
         With JAX in float32.
     """
+    psfs = ChunkPsfs.of(psf_pixels, source, backend, oversampling)
+    size = size or common_size(source, psfs, noise)
+    measure = response_measurer(source, backend=backend, noise=noise, size=size, seed=seed)
+    return measure_chunks(source, psfs, measure, chunk=chunk, quiet=quiet)
+
+
+def response_measurer(
+    source: StampSource, *, backend: Backend, noise: Noise, size: float | None, seed: int
+) -> MeasureChunk:
+    """Return what measures the responses of a chunk of a source.
+
+    Parameters
+    ----------
+    source, backend, noise, seed
+        As for `measure_source_responses`.
+    size : float or None
+        Of the weight: the same for all galaxies; None only if there are none.
+
+    Raises
+    ------
+    FdntValueError
+        With JAX in float32.
+    """
     if (backend.library, backend.dtype) == ("jax", "float32"):
         raise FdntValueError(
             "responses need 64-bit integers, which JAX has with --dtype float64 only"
         )
     names = galaxy_numbers(source.ids)
-    psfs = ChunkPsfs.of(psf_pixels, source, backend, oversampling)
-    size = size or _size_for_all(source, psfs, noise)
 
     def measure(part: StampChunk, stamps: Array, psf: Psf) -> Table:
         xp = array_namespace(stamps=stamps)
@@ -77,7 +99,7 @@ def measure_source_responses(
             size=size,
         ).to_table()
 
-    return measure_chunks(source, psfs, measure, chunk=chunk, quiet=quiet)
+    return measure
 
 
 def galaxy_numbers(ids: NDArray[Any]) -> NDArray[np.int64]:
@@ -108,7 +130,7 @@ def _hash(name: Any) -> int:
     return int.from_bytes(digest, "big") >> 1
 
 
-def _size_for_all(source: StampSource, psfs: ChunkPsfs, noise: Noise) -> float | None:
+def common_size(source: StampSource, psfs: ChunkPsfs, noise: Noise) -> float | None:
     """Return the default size for all galaxies together, which no chunk of them knows."""
     if source.n_gal == 0:
         return None

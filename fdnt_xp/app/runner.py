@@ -3,142 +3,42 @@
 from __future__ import annotations
 
 import sys
-import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
 from fdnt_xp.app.backends import Backend
+from fdnt_xp.app.chunks import ChunkSize
 from fdnt_xp.arrays import Array
+from fdnt_xp.data.fits_pixels import let_go
 from fdnt_xp.data.images import Pixels, native_pixels
 from fdnt_xp.data.ivar import IvarSource
-from fdnt_xp.data.noise import BorderNoise, measure_border_noise
-from fdnt_xp.data.noise_power import NoisePower, measure_noise_power, noise_stamps
 from fdnt_xp.data.stamps import StampChunk, StampSource
-from fdnt_xp.errors import FdntValueError, FdntWarning, RangeError, ShapeMismatchError
+from fdnt_xp.errors import FdntValueError, ShapeMismatchError
 from fdnt_xp.fourier.psf import Psf
 from fdnt_xp.shapes.measure import measure_shapes
 from fdnt_xp.shapes.methods import ShapeMethod
+from fdnt_xp.shapes.psf_shapes import PsfShapes, measure_psf_shapes
+from fdnt_xp.shapes.results import PSF_COLUMNS
 
 if TYPE_CHECKING:
     from astropy.table import Table
 
-CHUNK_ON_CPU = 256
-"""Galaxies at a time, unless told otherwise: the progress bar moves every second or so."""
-CHUNK_ON_GPU = 8192
-"""Enough to fill a GPU; 64 x 64 pixels in float64 are 268 MB."""
-
+IMAGE_COLUMNS: Final[dict[str, tuple[str | None, str]]] = {
+    "id": (None, "name or number of the galaxy"),
+    "x": ("pix", "position given, along columns, 0-based"),
+    "y": ("pix", "position given, along rows, 0-based"),
+    "x_image": ("pix", "centroid on the image, along columns, 0-based"),
+    "y_image": ("pix", "centroid on the image, along rows, 0-based"),
+}
+"""Unit and description of the columns that come before those measured."""
 
 MeasureChunk: TypeAlias = "Callable[[StampChunk, Array, Psf], Table]"
 """Measures the stamps of a chunk, with their PSF, both where the backend computes."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Noise:
-    """The noise that is handed to the measurement.
-
-    Parameters
-    ----------
-    variance : float or None
-        Per pixel; None if there is none.
-    border : BorderNoise, optional
-        What it was measured from: the borders of the stamps,
-    blank : NoisePower, optional
-        or blank stamps; it was given if both are None.
-    mapped : bool
-        Whether a map has it for each pixel; there is no number then.
-    """
-
-    variance: float | None
-    border: BorderNoise | None = None
-    blank: NoisePower | None = None
-    mapped: bool = False
-
-    @property
-    def origin(self) -> str:
-        """Where the number came from."""
-        if self.mapped:
-            return "weight map"
-        if self.blank is not None:
-            return "noise image"
-        return "given" if self.border is None else "stamp borders"
-
-    @property
-    def relative_err(self) -> float | None:
-        """Relative error of the variance; None if it was given."""
-        measured = self.blank or self.border
-        if measured is None or self.variance is None:
-            return None
-        return measured.variance_err / self.variance
-
-    @property
-    def power(self) -> NDArray[np.float64] | None:
-        """Power spectrum, shape (ny, nx); None if the noise is white as far as is known."""
-        return None if self.blank is None or self.blank.is_white else self.blank.power
-
-
-def find_noise(
-    source: StampSource,
-    given: float | None = None,
-    blank: Pixels | None = None,
-    *,
-    mask: StampSource | None = None,
-    mapped: bool = False,
-) -> Noise:
-    """Return the variance given, or the noise of blank sky, or that of the stamps' borders.
-
-    Warns (`FdntWarning`) of a background left in the image, and if there is no noise.
-
-    Parameters
-    ----------
-    source : StampSource
-        The stamps.
-    given : float, optional
-        Variance of a pixel.
-    blank : array, shape (height, width) or (n, ny, nx), optional
-        Image of noise, or stamps of it of the shape of those of the source.
-    mask : StampSource, optional
-        Beside the source; pixels of the borders where it is not 0 are left out.
-    mapped : bool
-        Whether a map has the inverse variance of each pixel, so that none is to be found.
-    """
-    if mapped and (given is not None or blank is not None):
-        raise FdntValueError(
-            "--weight says what the noise of each pixel is: give no --noise-variance and no "
-            "--noise-image with it"
-        )
-    if mapped:
-        return Noise(variance=None, mapped=True)
-    if given is not None and blank is not None:
-        raise FdntValueError("give --noise-variance or --noise-image, not both")
-    if given is not None:
-        if not (np.isfinite(given) and given > 0):
-            raise RangeError("noise_variance", given, 0.0, None)
-        return Noise(variance=given)
-    if blank is not None:
-        measured = measure_noise_power(_blank_stamps(blank, source.stamp_shape))
-        return Noise(variance=measured.variance, blank=measured)
-    border = measure_border_noise(source, mask)
-    if border.has_background:
-        warnings.warn(
-            f"the borders of the stamps are not at zero but at {border.level:.4g} +- "
-            f"{border.level_err:.2g} (noise {border.variance**0.5:.4g}): "
-            "take the background off the image",
-            FdntWarning,
-            stacklevel=2,
-        )
-    if not border.known and source.n_gal:
-        warnings.warn(
-            "no noise can be measured on the borders of the stamps, so there are no errors "
-            "and no S/N; give the variance (--noise-variance, --noise-image)",
-            FdntWarning,
-            stacklevel=2,
-        )
-    return Noise(variance=border.variance if border.known else None, border=border)
 
 
 def measure_source(
@@ -189,6 +89,22 @@ def measure_source(
     ShapeMismatchError
         If there are PSFs for another number of galaxies.
     """
+    psfs = ChunkPsfs.of(psf_pixels, source, backend, oversampling)
+    measure = shape_measurer(
+        method, backend=backend, noise_variance=noise_variance, ivar=ivar, size=size
+    )
+    return measure_chunks(source, psfs, measure, chunk=chunk, quiet=quiet)
+
+
+def shape_measurer(
+    method: ShapeMethod,
+    *,
+    backend: Backend,
+    noise_variance: float | None,
+    ivar: IvarSource | None,
+    size: float | None,
+) -> MeasureChunk:
+    """Return what measures the shapes of a chunk; the parameters are those of `measure_source`."""
 
     def measure(part: StampChunk, stamps: Array, psf: Psf) -> Table:
         if ivar is None:
@@ -196,8 +112,7 @@ def measure_source(
         weighted = backend.from_numpy(ivar.read(part))
         return method(stamps, psf, ivar=weighted, size=size).to_table()
 
-    psfs = ChunkPsfs.of(psf_pixels, source, backend, oversampling)
-    return measure_chunks(source, psfs, measure, chunk=chunk, quiet=quiet)
+    return measure
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,12 +129,15 @@ class ChunkPsfs:
         PSF pixels per image pixel.
     common : Psf or None
         The one of all, if there is one.
+    common_shape : PsfShapes or None
+        Its shape.
     """
 
     pixels: Pixels
     backend: Backend
     oversampling: float
-    common: Psf | None
+    common: Psf | None = None
+    common_shape: PsfShapes | None = None
 
     @classmethod
     def of(
@@ -239,15 +157,23 @@ class ChunkPsfs:
             )
         if pixels.ndim == 3 and len(pixels) == 1:
             pixels = pixels[0]
-        psfs = cls(pixels=pixels, backend=backend, oversampling=oversampling, common=None)
-        return replace(psfs, common=psfs._make(pixels)) if pixels.ndim == 2 else psfs
+        psfs = cls(pixels=pixels, backend=backend, oversampling=oversampling)
+        if pixels.ndim == 3:
+            return psfs
+        common = psfs._make(pixels)
+        return replace(psfs, common=common, common_shape=_psf_shapes(common))
 
     def rows(self, rows: slice) -> Psf:
         """Return the PSF of a range of galaxies."""
         return self.common or self._make(self.pixels[rows])
 
+    def shapes(self, psf: Psf) -> PsfShapes:
+        """Return the shapes of what `rows` returned."""
+        return self.common_shape or _psf_shapes(psf)
+
     def _make(self, pixels: Pixels) -> Psf:
         image = self.backend.from_numpy(native_pixels(pixels))
+        let_go(self.pixels)
         return Psf.from_image(image, oversampling=self.oversampling)
 
 
@@ -274,53 +200,98 @@ def measure_chunks(
     quiet : bool
         No progress bar; there is none either where stderr is not a terminal.
     """
-    chunk = chunk or (CHUNK_ON_CPU if psfs.backend.on_cpu else CHUNK_ON_GPU)
-    tables = []
-    bar = tqdm(
-        total=source.n_gal, unit=" galaxies", leave=False, disable=quiet or not sys.stderr.isatty()
+    size = ChunkSize(chunk, psfs.backend)
+    with galaxy_bar(source.n_gal, quiet=quiet) as bar:
+        return measure_rows(source, psfs, measure, (0, source.n_gal), size=size, report=bar.update)
+
+
+def measure_rows(
+    source: StampSource,
+    psfs: ChunkPsfs,
+    measure: MeasureChunk,
+    rows: tuple[int, int],
+    *,
+    size: ChunkSize,
+    report: Callable[[int], object] | None = None,
+) -> Table:
+    """Measure rows `start` to `stop - 1` of a source, as `measure_chunks` does.
+
+    Parameters
+    ----------
+    source, psfs, measure
+        As for `measure_chunks`.
+    rows : tuple of int
+        start and stop; there may be none.
+    size : ChunkSize
+        Galaxies at a time.
+    report : callable, optional
+        Is told after each chunk how many galaxies it had.
+    """
+
+    def one(start: int, stop: int) -> Table:
+        part = source.read(start, stop)
+        psf = psfs.rows(part.rows)
+        measured = measure(part, psfs.backend.from_numpy(part.stamps), psf)
+        table = _table(source, part, measured, psfs.shapes(psf))
+        if report is not None:
+            report(len(table))
+        return table
+
+    # No galaxies still give their one table, of no rows.
+    return _stack(list(size.each(*rows, one)) or [one(*rows)])
+
+
+def galaxy_bar(n_gal: int, *, quiet: bool, n_before: int = 0) -> tqdm:
+    """Return a progress bar; it shows nothing if quiet, or where stderr is not a terminal."""
+    return tqdm(
+        total=n_gal,
+        initial=n_before,
+        unit=" galaxies",
+        leave=False,
+        disable=quiet or not sys.stderr.isatty(),
     )
-    with bar:
-        # An empty source still gives its one table, of no rows.
-        for part in source.chunks(chunk) if source.n_gal else [source.read(0, 0)]:
-            stamps = psfs.backend.from_numpy(part.stamps)
-            tables.append(_table(source, part, measure(part, stamps, psfs.rows(part.rows))))
-            bar.update(len(part.flags))
-    return _stack(tables)
 
 
-def _blank_stamps(blank: Pixels, shape: tuple[int, int]) -> Pixels:
-    """Return stamps of a blank image, or the planes of a cube, in memory."""
-    if blank.ndim == 2:
-        return noise_stamps(native_pixels(blank), shape)
-    if blank.shape[1:] != shape:
-        raise ShapeMismatchError(
-            f"the planes of the noise image have {blank.shape[2]} x {blank.shape[1]} pixels, "
-            f"the stamps of the galaxies {shape[1]} x {shape[0]}; they must be the same"
-        )
-    return native_pixels(blank)
+def _psf_shapes(psf: Psf) -> PsfShapes:
+    """Return the shapes of PSFs, NaN where their images have too few pixels for any."""
+    try:
+        return measure_psf_shapes(psf)
+    except FdntValueError:
+        n_star = len(psf.image)
+        nan = np.full(n_star, np.nan)
+        return PsfShapes(eta=np.full((n_star, 2), np.nan), size=nan)
 
 
-def _table(source: StampSource, part: StampChunk, measured: Table) -> Table:
-    """Put the columns of the image before those that were measured."""
+def _table(source: StampSource, part: StampChunk, measured: Table, shapes: PsfShapes) -> Table:
+    """Put the columns of the image before those that were measured, and the PSF behind."""
     from astropy.table import Table
 
     centroid = np.stack([measured["x"], measured["y"]], axis=-1) + source.corners[part.rows]
     _withdraw(measured, part.flags)
     table = Table(meta=measured.meta)
-    columns: dict[str, tuple[NDArray[Any], str | None, str]] = {
-        "id": (source.ids[part.rows], None, "name or number of the galaxy"),
-        "x": (source.positions[part.rows, 0], "pix", "position given, along columns, 0-based"),
-        "y": (source.positions[part.rows, 1], "pix", "position given, along rows, 0-based"),
-        "x_image": (centroid[:, 0], "pix", "centroid on the image, along columns, 0-based"),
-        "y_image": (centroid[:, 1], "pix", "centroid on the image, along rows, 0-based"),
+    of_image = {
+        "id": source.ids[part.rows],
+        "x": source.positions[part.rows, 0],
+        "y": source.positions[part.rows, 1],
+        "x_image": centroid[:, 0],
+        "y_image": centroid[:, 1],
     }
-    for name, (values, unit, description) in columns.items():
-        table[name] = values
-        table[name].unit, table[name].description = unit, description
+    _add(table, of_image, IMAGE_COLUMNS)
     for name in measured.colnames:
         if name not in ("x", "y"):
             table[name] = measured[name]
+    _add(table, shapes.columns(len(measured)), PSF_COLUMNS)
     return table
+
+
+def _add(
+    table: Table,
+    columns: Mapping[str, NDArray[Any]],
+    described: Mapping[str, tuple[str | None, str]],
+) -> None:
+    for name, values in columns.items():
+        table[name] = values
+        table[name].unit, table[name].description = described[name]
 
 
 def _withdraw(measured: Table, flags: NDArray[np.int32]) -> None:

@@ -44,14 +44,27 @@ def mean_and_error(values: NDArray[Any]) -> tuple[float, float]:
     return mean, error
 
 
-def summary_lines(table: Table, seconds: float | None = None) -> Iterator[str]:
-    """Yield the lines of the closing summary."""
+def summary_lines(table: Table, seconds: float | None = None, n_before: int = 0) -> Iterator[str]:
+    """Yield the lines of the closing summary.
+
+    Parameters
+    ----------
+    table : astropy.table.Table
+        The catalog.
+    seconds : float, optional
+        That measuring took,
+    n_before : int
+        of all galaxies but these, which were measured before.
+    """
     good = measured_rows(table)
     n_gal, n_good = len(table), int(np.sum(good))
     share = f" ({n_good / n_gal:.2%})" if n_gal else ""
     yield f"measured   {n_good} of {n_gal} galaxies{share}"
-    if seconds is not None and n_gal:
-        yield f"time       {seconds:.1f} s, {1e3 * seconds / n_gal:.3g} ms per galaxy"
+    if n_before:
+        yield f"resumed    {n_before} of them were measured before"
+    if seconds is not None and n_gal > n_before:
+        each = 1e3 * seconds / (n_gal - n_before)
+        yield f"time       {seconds:.1f} s, {each:.3g} ms per galaxy"
     counts = count_flags(table)
     for title, failed in (("failed", True), ("noted", False)):
         for name, count in counts.items():

@@ -83,6 +83,23 @@ def open_workers(jobs: int = 1, scheduler: str | None = None) -> Iterator[Worker
         client.close()
 
 
+def warn_of_too_many(jobs: int) -> None:
+    """Warn (`FdntWarning`) if processes and their threads are more than this machine's cores."""
+    asked = os.environ.get(_THREADS[0], "")
+    threads = int(asked) if asked.isdecimal() else 1
+    allowed = getattr(os, "sched_getaffinity", None)
+    cores = len(allowed(0)) if allowed is not None else os.cpu_count() or 1
+    if jobs * threads > cores:
+        of_each = f" of {_THREADS[0]}={threads} threads" if threads > 1 else ""
+        many = "process" if jobs == 1 else "processes"
+        warnings.warn(
+            f"{jobs} {many}{of_each} are more than the {cores} cores there are: "
+            "fewer would be as fast",
+            FdntWarning,
+            stacklevel=2,
+        )
+
+
 @dataclass(frozen=True)
 class _Here:
     """The process that asks."""

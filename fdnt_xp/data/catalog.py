@@ -1,9 +1,9 @@
-"""Catalogs on disk: FITS, ECSV or Parquet by suffix, with units and descriptions in all."""
+"""Catalogs on disk: FITS, ECSV, Parquet or HDF5 by suffix, with units and descriptions in all."""
 
 from __future__ import annotations
 
-import importlib.util
 import os
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final
@@ -12,15 +12,17 @@ from astropy.io import fits
 from astropy.table import MaskedColumn, Table
 from astropy.table.meta import get_header_from_yaml
 
-from fdnt_xp.data.files import check_writable, new_file
-from fdnt_xp.data.provenance import COMMENTS
-from fdnt_xp.errors import CatalogError, MissingExtraError
-
-_EXTENSION: Final = "SHAPES"
+import fdnt_xp
+from fdnt_xp.data.files import check_writable
+from fdnt_xp.data.provenance import SCHEMA
+from fdnt_xp.data.row_batches import EXTENSION, check_suffix, new_catalog
+from fdnt_xp.errors import CatalogError, FdntWarning
 
 
 def write_catalog(table: Table, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
     """Write a table, whole or not at all, in the format of its suffix.
+
+    `fdnt_xp.data.row_batches.new_catalog` writes one that memory cannot hold.
 
     Parameters
     ----------
@@ -28,7 +30,7 @@ def write_catalog(table: Table, path: str | os.PathLike[str], *, overwrite: bool
         With units, descriptions, and `meta` of plain numbers and strings; keys of `meta`
         are FITS keywords, upper case and at most eight characters.
     path : path
-        `.fits`, `.fit`, `.ecsv` or `.parquet`.
+        `.fits`, `.fit`, `.ecsv`, `.parquet`, `.hdf5` or `.h5`.
     overwrite : bool
         Whether a file that exists may be replaced.
 
@@ -37,18 +39,18 @@ def write_catalog(table: Table, path: str | os.PathLike[str], *, overwrite: bool
     CatalogError
         If the suffix is none of these, the file exists, or it cannot be written.
     MissingExtraError
-        For Parquet without pyarrow.
+        For Parquet without pyarrow, for HDF5 without h5py.
     """
-    write, _ = _format_of(path)
-    with new_file(path, overwrite=overwrite) as temporary:
-        write(table, temporary)
+    with new_catalog(path, overwrite=overwrite) as catalog:
+        catalog.append(table)
 
 
 def read_catalog(path: str | os.PathLike[str]) -> Table:
     """Read a table that `write_catalog` wrote.
 
     The same table comes back from all formats: names, numbers, NaN, units, descriptions and
-    provenance (`meta`).
+    provenance (`meta`). Warns (`FdntWarning`) of a catalog of a later version of the package
+    whose columns mean something else (`SCHEMA`).
 
     Raises
     ------
@@ -56,39 +58,31 @@ def read_catalog(path: str | os.PathLike[str]) -> Table:
         If there is no such file, or it does not hold a table in the format of its suffix.
     """
     file = Path(path)
-    _, read = _format_of(file)
+    check_suffix(file)
     if not file.is_file():
         problem = "is a folder" if file.is_dir() else "does not exist"
         raise CatalogError(f"cannot read the catalog: {file} {problem}")
     try:
-        return read(file)
+        table = _READERS[file.suffix.lower()](file)
     except Exception as error:
         # Whatever a reader chokes on, the user's news is which file it was.
         reason = str(error).strip().partition("\n")[0] or type(error).__name__
         raise CatalogError(f"cannot read the catalog {file}: {reason}") from error
+    schema = table.meta.get("SCHEMA")
+    if isinstance(schema, int) and schema > SCHEMA:
+        warnings.warn(
+            f"{file} has columns of version {schema}, and fdnt_xp {fdnt_xp.__version__} knows "
+            f"those up to {SCHEMA}: some may mean something else",
+            FdntWarning,
+            stacklevel=2,
+        )
+    return table
 
 
 def check_catalog(path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
     """Raise what `write_catalog` would raise, before there is anything to write."""
-    _format_of(path)
+    check_suffix(path)
     check_writable(path, overwrite=overwrite)
-
-
-def _write_fits(table: Table, path: Path) -> None:
-    plain = Table(table, copy=False)
-    descriptions = [column.description for column in table.itercols()]
-    for column in plain.itercols():
-        # Else astropy would hide it in a block of YAML, which nothing else reads.
-        column.description = None
-    hdu = fits.table_to_hdu(plain)
-    hdu.header["EXTNAME"] = _EXTENSION
-    for keyword, comment in COMMENTS.items():
-        if keyword in hdu.header:
-            hdu.header.comments[keyword] = comment
-    for number, description in enumerate(descriptions, start=1):
-        if description:
-            hdu.header.set(f"TCOMM{number}", description, after=f"TFORM{number}")
-    fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(path)
 
 
 def _read_fits(path: Path) -> Table:
@@ -104,20 +98,12 @@ def _read_fits(path: Path) -> Table:
     return table
 
 
-def _write_ecsv(table: Table, path: Path) -> None:
-    table.write(path, format="ascii.ecsv")
-
-
 def _read_ecsv(path: Path) -> Table:
     table = Table.read(path, format="ascii.ecsv")
     for name in table.colnames:
         if isinstance(table[name], MaskedColumn) and table[name].dtype.kind == "U":
             table.replace_column(name, table[name].filled(""))  # empty, not missing
     return table
-
-
-def _write_parquet(table: Table, path: Path) -> None:
-    table.write(path, format="parquet")
 
 
 def _read_parquet(path: Path) -> Table:
@@ -138,24 +124,15 @@ def _read_parquet(path: Path) -> Table:
     return table
 
 
-Format = tuple[Callable[[Table, Path], None], Callable[[Path], Table]]
+def _read_hdf5(path: Path) -> Table:
+    return Table.read(path, format="hdf5", path=EXTENSION, character_as_bytes=False)
 
-_FORMATS: Final[dict[str, Format]] = {
-    ".fits": (_write_fits, _read_fits),
-    ".fit": (_write_fits, _read_fits),
-    ".ecsv": (_write_ecsv, _read_ecsv),
-    ".parquet": (_write_parquet, _read_parquet),
+
+_READERS: Final[dict[str, Callable[[Path], Table]]] = {
+    ".fits": _read_fits,
+    ".fit": _read_fits,
+    ".ecsv": _read_ecsv,
+    ".parquet": _read_parquet,
+    ".hdf5": _read_hdf5,
+    ".h5": _read_hdf5,
 }
-
-
-def _format_of(path: str | os.PathLike[str]) -> Format:
-    suffix = Path(path).suffix.lower()
-    if suffix not in _FORMATS:
-        raise CatalogError(
-            f"the suffix of {path} is no known catalog format; known are {', '.join(_FORMATS)}"
-        )
-    if suffix == ".parquet" and importlib.util.find_spec("pyarrow") is None:
-        raise MissingExtraError(
-            "Parquet needs pyarrow, which is not installed: pip install 'fdnt-xp[parquet]'"
-        )
-    return _FORMATS[suffix]

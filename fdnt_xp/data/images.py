@@ -1,4 +1,4 @@
-"""Images from FITS files, mapped into memory where the file allows it."""
+"""Images from FITS and HDF5 files, left on disk where the file allows it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import os
 import re
 import warnings
 import zlib
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -15,10 +16,13 @@ from astropy.io import fits
 from astropy.utils.exceptions import AstropyWarning
 from numpy.typing import NDArray
 
+from fdnt_xp.data import fits_pixels
 from fdnt_xp.data.files import new_file
-from fdnt_xp.errors import CatalogError
+from fdnt_xp.data.fits_pixels import FitsSections, map_pixels
+from fdnt_xp.data.hdf5 import Hdf5Pixels, is_hdf5, open_hdf5, split_name
+from fdnt_xp.errors import CatalogError, FdntError
 
-Pixels: TypeAlias = "NDArray[Any]"
+Pixels: TypeAlias = NDArray[Any] | Hdf5Pixels | FitsSections
 """Pixels as the file holds them: any number type, either byte order, perhaps on disk still."""
 
 _SHAPES = {2: "an image (ny, nx)", 3: "a cube (n, ny, nx)"}
@@ -29,13 +33,14 @@ _UNREADABLE = (OSError, EOFError, ValueError, TypeError, KeyError, IndexError, z
 def read_image(
     path: str | os.PathLike[str], *, ndim: Collection[int] = (2,), what: str = "image"
 ) -> Pixels:
-    """Read the pixels of a FITS file, without loading them if they can be mapped.
+    """Open the pixels of a FITS or HDF5 file, without loading them if they can stay there.
 
     Parameters
     ----------
     path : path
-        The file; the first image in it is taken, or that of a named or numbered extension,
-        `file.fits[SCI]` or `file.fits[2]`.
+        The file. Of FITS the first image is taken, or that of a named or numbered extension,
+        `file.fits[SCI]` or `file.fits[2]`; of HDF5 (`.h5`, `.hdf5`) the only dataset, or the
+        one that is named, `file.h5::dataset`.
     ndim : collection of int
         Which ranks will do: 2 for an image, 3 for a cube.
     what : str
@@ -44,38 +49,52 @@ def read_image(
     Returns
     -------
     array, shape (ny, nx) or (n, ny, nx)
-        As in the file; `native_pixels` makes numbers for computing of it, or of a part.
+        As in the file, read where it is indexed; `native_pixels` makes numbers for computing
+        of it, or of a part.
 
     Raises
     ------
     CatalogError
-        If there is no such file, it is truncated or not FITS, it has no image, or the image
-        has another rank.
+        If there is no such file, it is truncated or not what its name says, it has no such
+        image, or the image has another rank.
+    MissingExtraError
+        For HDF5 without h5py.
     """
+    if is_hdf5(path):
+        return _of_rank(open_hdf5(path, what=what), ndim, f"the {what} {os.fspath(path)}")
     file, extension = _split(path)
     if not file.is_file():
         problem = "is a folder" if file.is_dir() else "does not exist"
         raise CatalogError(f"cannot read the {what}: {file} {problem}")
+    with fits_errors(file, what):
+        pixels = _first_image(file, extension, what)
+    return _of_rank(pixels, ndim, f"the {what} {file}")
+
+
+@contextmanager
+def fits_errors(file: Path, what: str) -> Iterator[None]:
+    """Let whatever astropy says of a broken file be one `CatalogError` that names it.
+
+    Parameters
+    ----------
+    file : Path
+    what : str
+        What the file is to the caller, for messages.
+    """
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            pixels = _first_image(file, extension, what)
-        except CatalogError:
+            yield
+        except FdntError:
             raise
         except (*_UNREADABLE, fits.VerifyError) as error:
             reason = _truncation(caught) or re.split(r"\n|\. ", str(error))[0]
             raise CatalogError(f"cannot read the {what} {file}: {reason}") from error
     if reason := _truncation(caught):
         raise CatalogError(f"cannot read the {what} {file}: {reason}")
-    if pixels.ndim not in ndim:
-        expected = " or ".join(_SHAPES.get(n, f"rank {n}") for n in sorted(ndim))
-        raise CatalogError(
-            f"the {what} {file} has {pixels.ndim} axes, shape {pixels.shape}; expected {expected}"
-        )
-    return pixels
 
 
-def native_pixels(pixels: Pixels) -> Pixels:
+def native_pixels(pixels: Pixels) -> NDArray[Any]:
     """Return a contiguous floating-point copy in memory, in the machine's byte order.
 
     float32 and float64 keep their precision, everything else becomes float64.
@@ -107,6 +126,20 @@ def write_image(
         hdu.writeto(temporary)
 
 
+def image_file(path: str | os.PathLike[str]) -> Path:
+    """Return the file of a name that `read_image` takes."""
+    return split_name(path)[0] if is_hdf5(path) else _split(path)[0]
+
+
+def _of_rank(pixels: Pixels, ndim: Collection[int], name: str) -> Pixels:
+    if pixels.ndim not in ndim:
+        expected = " or ".join(_SHAPES.get(n, f"rank {n}") for n in sorted(ndim))
+        raise CatalogError(
+            f"{name} has {pixels.ndim} axes, shape {pixels.shape}; expected {expected}"
+        )
+    return pixels
+
+
 def _split(path: str | os.PathLike[str]) -> tuple[Path, str | int | None]:
     """Take the extension off `file.fits[ext]`, unless a file has just that name."""
     match = re.fullmatch(r"(.+)\[([^\[\]]+)\]", os.fspath(path))
@@ -127,20 +160,26 @@ def _first_image(file: Path, extension: str | int | None, what: str) -> Pixels:
             chosen = [hdus[extension]]
         else:
             chosen = hdus
-        for number, hdu in enumerate(chosen):
+        for hdu in chosen:
             if hdu.is_image and hdu.shape and all(hdu.shape):
-                index = extension if extension is not None else number
                 break
         else:
             raise CatalogError(f"the {what} {file} holds no image")
-        try:
-            return np.asarray(hdu.data)
-        except ValueError as error:
-            if "memory-map" not in str(error):
-                raise
-    # Pixels that are stored scaled (BZERO, BSCALE) have to be computed.
+        index = hdus.index_of(hdu)
+        if not isinstance(hdu, fits.CompImageHDU):
+            try:
+                mapped = map_pixels(file, hdu)
+                return np.asarray(hdu.data) if mapped is None else mapped
+            except ValueError as error:
+                if "memory-map" not in str(error):
+                    raise
+    # Pixels that are packed, or stored scaled (BZERO, BSCALE), have to be computed.
     with fits.open(file, memmap=False) as hdus:
-        return np.asarray(hdus[index].data)
+        hdu = hdus[index]
+        first = np.asarray(hdu.section[:1])
+        if first.nbytes * hdu.shape[0] > fits_pixels.IN_MEMORY:
+            return FitsSections(file=file, number=index, shape=hdu.shape, dtype=first.dtype)
+        return np.asarray(hdu.data)
 
 
 def _truncation(caught: list[warnings.WarningMessage]) -> str | None:

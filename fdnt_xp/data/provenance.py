@@ -12,12 +12,21 @@ import fdnt_xp
 
 Value = str | int | float | bool
 
+SCHEMA: Final = 1
+"""Version of the columns: what they are called and mean, and in which units.
+
+It grows when a column goes, or means something else; new columns alone do not change it.
+
+1. The first that is documented.
+"""
+
 COMMENTS: Final[dict[str, str]] = {
     "CREATOR": "program that made this table",
     "FDNTVER": "its version",
+    "SCHEMA": "version of the columns",
     "NUMPYVER": "version of NumPy",
     "DATE": "when it was made (UTC)",
-    "METHOD": "shape method, or responses",
+    "METHOD": "shape method, responses, exposures",
     "BACKEND": "array library",
     "LIBVER": "its version",
     "DEVICE": "where the arrays were",
@@ -25,12 +34,15 @@ COMMENTS: Final[dict[str, str]] = {
     "IMAGE": "image that was measured",
     "PSFIMAGE": "image of the PSF",
     "POSCAT": "table of positions",
-    "LAYOUT": "how stamps were found: grid, cube, positions",
+    "LAYOUT": "how stamps were found: grid, cube, meds, ...",
     "CELL": "[pix] side of a grid cell",
     "STAMPSIZ": "[pix] side of a stamp",
     "XCOLUMN": "column of x in the table of positions",
     "YCOLUMN": "column of y in the table of positions",
     "ORIGIN": "first pixel's coordinate in that table",
+    "CUTOUTS": "which cutouts were taken: all, epochs, first",
+    "BADBITS": "bits of the mask that make a pixel missing",
+    "SEGMENTS": "pixels of other objects: mask, ignore",
     "OVERSAMP": "PSF pixels per image pixel",
     "NOISEVAR": "noise variance per pixel that was used",
     "NOISEERR": "its relative standard error",
@@ -63,6 +75,7 @@ def provenance(**facts: Value | None) -> dict[str, Value]:
     meta: dict[str, Value] = {
         "CREATOR": "fdnt_xp",
         "FDNTVER": fdnt_xp.__version__,
+        "SCHEMA": SCHEMA,
         "NUMPYVER": np.__version__,
         "DATE": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S"),
     }

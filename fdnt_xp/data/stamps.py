@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fdnt_xp.data.fits_pixels import let_go
 from fdnt_xp.data.images import Pixels
 from fdnt_xp.errors import FdntValueError, RangeError, ShapeMismatchError
 from fdnt_xp.flags import Flag
@@ -85,6 +86,7 @@ class StampSource:
         for place, row in enumerate(rows):
             if self.flags[row] == 0:
                 stamps[place] = self._cut(int(row))
+        let_go(self.pixels)
         return stamps
 
     def beside(self, pixels: Pixels, what: str) -> StampSource:

@@ -14,6 +14,7 @@ from astropy.utils.exceptions import AstropyWarning
 from numpy.typing import NDArray
 
 from fdnt_xp.data.catalog import read_catalog
+from fdnt_xp.data.hdf5 import is_hdf5, read_hdf5_table
 from fdnt_xp.errors import CatalogError, FdntValueError
 
 
@@ -36,7 +37,7 @@ class Positions:
 def read_positions(
     path: str | os.PathLike[str], *, x_column: str = "x", y_column: str = "y", origin: int = 0
 ) -> Positions:
-    """Read positions from a table: FITS, ECSV, CSV, Parquet, VOTable, SExtractor, plain text.
+    """Read positions from a table: FITS, ECSV, CSV, Parquet, HDF5, VOTable, SExtractor, text.
 
     Parameters
     ----------
@@ -67,6 +68,7 @@ def read_any(path: str | os.PathLike[str], what: str) -> Table:
     Parameters
     ----------
     path : path
+        The file; of HDF5 also a dataset or group of it, `file.h5::name`.
     what : str
         What the table is to the caller, for messages.
 
@@ -75,6 +77,8 @@ def read_any(path: str | os.PathLike[str], what: str) -> Table:
     CatalogError
         If there is no such file, or it cannot be read.
     """
+    if is_hdf5(path):
+        return read_hdf5_table(path, what)
     path = Path(path)
     if not path.is_file():
         problem = "is a folder" if path.is_dir() else "does not exist"

@@ -14,6 +14,7 @@ wave number there (`Psf.through`): the same for one PSF behind any pixels.
 
 from __future__ import annotations
 
+import numbers
 from dataclasses import dataclass, replace
 from types import ModuleType
 
@@ -126,6 +127,9 @@ class Psf:
             raise ShapeMismatchError(
                 f"image must have the shape (ny, nx) or (n_gal, ny, nx), not {image.shape}"
             )
+        for name, value in (("floor", floor), ("oversampling", oversampling)):
+            if not isinstance(value, numbers.Real):
+                raise FdntTypeError(f"{name} must be a number, not {value!r}")
         if not 0.0 < floor < 1.0:
             raise RangeError("floor", floor, 0.0, 1.0)
         if not (np.isfinite(oversampling) and oversampling > 0.0):

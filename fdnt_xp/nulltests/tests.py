@@ -25,6 +25,7 @@ from fdnt_xp.arrays import Array, Rows, array_namespace, blocks_in_cache, rows_o
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.transform import DeconvolvedStamps
 from fdnt_xp.nulltests.forms import ShearedForms, contract, sheared_forms
+from fdnt_xp.nulltests.scaled import scaled_tests
 from fdnt_xp.nulltests.weights import Weight
 
 
@@ -93,6 +94,8 @@ class TestNoise:
     flux, flux_variance : array, shape (n_gal,)
         Amplitude F of the Gaussian galaxy `F exp(-q sigma²/2)` that has the same sum under
         the weight.
+    scale_variance : array, shape (n_gal,)
+        Of t0 at fixed width.
     tests, matched : TestValues, MatchedWidth
         The raw tests and the width of the weight.
     """
@@ -103,6 +106,7 @@ class TestNoise:
     odd: Array
     flux: Array
     flux_variance: Array
+    scale_variance: Array
     tests: TestValues
     matched: MatchedWidth
 
@@ -136,16 +140,21 @@ class _Width:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Moments:
-    """All that the tests and their slopes need of the fields; (n_gal, number of moments).
+class _SizeMoments:
+    """What the size equation and its slopes need of the fields; (n_gal, number of moments).
 
-    `𝒯' = d𝒯/dq`, G is the Gaussian part of the weight, and W = 𝒯 G; the moments are those of
-    the degrees named.
+    `𝒯' = d𝒯/dq`; the moments are those of the degrees named.
     """
 
     t_re: Array  # 𝒯 Re: 0, 2
     t_im: Array  # 𝒯 Im: 1, 3
     dt_re: Array  # 𝒯' Re: 2, 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Moments(_SizeMoments):
+    """And what the tests and their slopes need; W = 𝒯 G, G the Gaussian part of the weight."""
+
     w_re: Array  # W Re: 0, 2, 4
     w_im: Array  # W Im: 1, 3
     dw_re: Array  # 𝒯' G Re: 4
@@ -162,7 +171,7 @@ class _PowerMoments:
     wg: Array  # W G: 0
 
 
-_Parts = TypeVar("_Parts", _Moments, _Width, _PowerMoments)
+_Parts = TypeVar("_Parts", _SizeMoments, _Moments, _Width, _PowerMoments)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -211,26 +220,7 @@ class NullTests:
 
     def scaled(self, eta: Array, tests: TestValues, matched: MatchedWidth) -> tuple[Array, Array]:
         """Return what `evaluate` does, from the raw tests and the width at `eta`."""
-        xp = array_namespace(eta=eta)
-        # ln s = |eta|/2. At eta = 0 its slope has no direction; the mean of all is 0.
-        norm = xp.sqrt(eta[:, 0] ** 2 + eta[:, 1] ** 2)
-        safe = xp.where(norm > 0, norm, xp.ones_like(norm))
-        ln_shrink_slope = 0.5 * eta / safe[:, None]
-        ln_shrink_slope = xp.concat([ln_shrink_slope, xp.zeros_like(eta)], axis=-1)
-        width_slope = matched.by_parameter + matched.by_ln_shrink[:, None] * ln_shrink_slope
-        slopes = (
-            tests.by_parameter
-            + tests.by_ln_shrink[:, :, None] * ln_shrink_slope[:, None, :]
-            + tests.by_width[:, :, None] * width_slope[:, None, :]
-        )
-        scale = tests.values[:, 4:]
-        inverse = inverse_if_positive(scale)
-        raw = tests.values[:, :4] * inverse
-        jac = (slopes[:, :4, :] - raw[:, :, None] * slopes[:, 4:, :]) * inverse[:, :, None]
-        inv = 1.0 / self.length
-        f = xp.concat([raw[:, :2], inv * raw[:, 2:]], axis=-1)
-        jac = xp.concat([jac[:, :2, :], inv * jac[:, 2:, :]], axis=1)
-        return f, xp.concat([jac[:, :, :2], self.length * jac[:, :, 2:]], axis=2)
+        return scaled_tests(eta, tests, matched, self.length)
 
     def at(self, eta: Array, centroid: Array) -> tuple[TestValues, MatchedWidth]:
         """Return the raw tests and the width of the weight.
@@ -245,6 +235,18 @@ class NullTests:
         moments, width, _ = self._moments(frame, centroid)
         matched = self._matched_width(frame, moments, width)
         return self._tests(frame, moments, width.width), matched
+
+    def widths(self, eta: Array, centroid: Array) -> MatchedWidth:
+        """Return the width of the weight as `at` does, without the tests."""
+        frame = _Frame(forms=sheared_forms(eta, self.weight.frame), shrink=shrink_factor(eta))
+        moments, widths = [], []
+        for rows in blocks_in_cache(self.galaxies.re):
+            block = self.take(rows)
+            f0, shrink = frame.forms.forms[0][rows, :], frame.shrink[rows]
+            view = block._view(f0, shrink, centroid[rows, :])
+            moments.append(self._size_moments(view))
+            widths.append(block._width(moments[-1].t_re, f0, shrink))
+        return self._matched_width(frame, _joined(moments), _joined(widths))
 
     def noise(self, eta: Array, centroid: Array, inverse_power: Array) -> TestNoise:
         """Return the noise of the raw tests, and the flux, at a solution.
@@ -265,12 +267,13 @@ class NullTests:
         matched = self._matched_width(frame, moments, width)
         tests = self._tests(frame, moments, width.width)
         even = self._with_width_noise(frame, matched, tests.by_width, power)
-        sum_gauss = power.wg[:, 0]
+        sum_gauss, f0 = power.wg[:, 0], frame.forms.forms[0]
         return TestNoise(
             even=_symmetric(even),
             odd=_symmetric(power.ww[:, 1:4]),
             flux=moments.w_re[:, 0] / sum_gauss,
             flux_variance=power.ww[:, 0] / sum_gauss**2,
+            scale_variance=contract(contract(power.ww[:, 4:], f0), f0)[:, 0],
             tests=tests,
             matched=matched,
         )
@@ -316,11 +319,11 @@ class NullTests:
             block = self.take(rows)
             f0, shrink = frame.forms.forms[0][rows, :], frame.shrink[rows]
             view = block._view(f0, shrink, centroid[rows, :])
-            t_re = self.grid.moments(view.psf_factor * view.re, 0, 2)
-            width = block._width(t_re, f0, shrink)
+            size = self._size_moments(view)
+            width = block._width(size.t_re, f0, shrink)
             gauss = _gauss(view.square, width.width)
             weight = view.psf_factor * gauss
-            moments.append(self._field_moments(view, t_re, gauss, weight))
+            moments.append(self._field_moments(view, size, gauss, weight))
             widths.append(width)
             if inverse_power is not None:
                 shared = int(inverse_power.shape[0]) == 1
@@ -334,12 +337,22 @@ class NullTests:
         factor, slope = self.weight.psf_factor(square, shrink)
         return _View(square=square, re=re, im=im, psf_factor=factor, psf_slope=slope)
 
-    def _field_moments(self, view: _View, t_re: Array, gauss: Array, weight: Array) -> _Moments:
-        moments, slope = self.grid.moments, view.psf_slope * gauss
-        return _Moments(
-            t_re=t_re,
+    def _size_moments(self, view: _View) -> _SizeMoments:
+        moments = self.grid.moments
+        return _SizeMoments(
+            t_re=moments(view.psf_factor * view.re, 0, 2),
             t_im=moments(view.psf_factor * view.im, 1, 3),
             dt_re=moments(view.psf_slope * view.re, 2, 4),
+        )
+
+    def _field_moments(
+        self, view: _View, size: _SizeMoments, gauss: Array, weight: Array
+    ) -> _Moments:
+        moments, slope = self.grid.moments, view.psf_slope * gauss
+        return _Moments(
+            t_re=size.t_re,
+            t_im=size.t_im,
+            dt_re=size.dt_re,
             w_re=moments(weight * view.re, 0, 2, 4),
             w_im=moments(weight * view.im, 1, 3),
             dw_re=moments(slope * view.re, 4),
@@ -365,8 +378,9 @@ class NullTests:
         if self.fixed_width is not None:
             zero = xp.zeros_like(flux)
             return _Width(width=self.fixed_width, slope=zero, at_bound=zero > 0)
-        # A mean square that noise made negative or tiny asks for the widest weight.
-        positive = (square > 0) & (flux > 0)
+        # A mean square that noise made negative or tiny asks for the widest weight; and
+        # pixels beyond all range, whose ratio would be NaN, for any.
+        positive = (square > 0) & (flux > 0) & xp.isfinite(flux)
         safe = xp.where(positive, square, xp.ones_like(square))
         inverse = xp.where(positive, flux / safe, xp.full_like(flux, 1e30))
         width, slope, at_bound = self.weight.matched_width(inverse, shrink)
@@ -374,7 +388,7 @@ class NullTests:
         slope = xp.where(positive, slope, xp.zeros_like(slope))
         return _Width(width=width, slope=slope, at_bound=at_bound)
 
-    def _matched_width(self, frame: _Frame, moments: _Moments, width: _Width) -> MatchedWidth:
+    def _matched_width(self, frame: _Frame, moments: _SizeMoments, width: _Width) -> MatchedWidth:
         """Return the width with its derivatives."""
         xp = array_namespace(t_re=moments.t_re)
         flux, a2 = moments.t_re[:, 0], moments.t_re[:, 1:]
@@ -405,7 +419,7 @@ class NullTests:
         )
 
     def _ln_mean_square_slopes(
-        self, frame: _Frame, moments: _Moments, flux: Array, square: Array
+        self, frame: _Frame, moments: _SizeMoments, flux: Array, square: Array
     ) -> tuple[Array, Array]:
         """Return the derivatives of `ln<|k'|²>` by (eta1, eta2, x0, y0) and by ln s."""
         xp = array_namespace(flux=flux)
@@ -474,13 +488,6 @@ def shrink_factor(eta: Array) -> Array:
     """Return `s = exp(|eta|/2)`, shape (n_gal,)."""
     xp = array_namespace(eta=eta)
     return xp.exp(0.5 * xp.sqrt(eta[:, 0] ** 2 + eta[:, 1] ** 2))
-
-
-def inverse_if_positive(scale: Array) -> Array:
-    """Return 1/x where x > 0, elsewhere NaN: tests over such a scale have no value."""
-    xp = array_namespace(scale=scale)
-    safe = xp.where(scale > 0, scale, xp.ones_like(scale))
-    return xp.where(scale > 0, 1.0 / safe, xp.full_like(scale, float("nan")))
 
 
 def _joined(parts: list[_Parts]) -> _Parts:

@@ -9,11 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Final
 
-from fdnt_xp.arrays import Array, Rows, array_namespace, blocks_in_cache, rows_of
+from fdnt_xp.arrays import Array, Rows, array_namespace, blocks_in_cache, device_of, rows_of
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.transform import DeconvolvedStamps
-from fdnt_xp.nulltests.dogleg import DoglegOptions, find_root
-from fdnt_xp.nulltests.tests import inverse_if_positive
+from fdnt_xp.nulltests.dogleg import DoglegOptions, RootProblem, find_root
+from fdnt_xp.nulltests.scaled import over_scale
 from fdnt_xp.nulltests.weights import Weight
 
 _WIDE: Final = 0.125
@@ -51,22 +51,32 @@ class DipoleTests:
         NaN where the denominator is not positive: there the weight sees no galaxy.
         """
         xp = array_namespace(x=x)
+        values, slopes = self.raw(self.length * x)
+        units = xp.asarray([1.0, 1.0, self.length], dtype=x.dtype, device=device_of(x))
+        f, jac = over_scale(values * units, slopes * units[:, None])
+        return f, self.length * jac
+
+    def raw(self, centroid: Array) -> tuple[Array, Array]:
+        """Return `sum W Im I~ k` and `sum W Re I~ |k|²`, (n_gal, 3), and slopes, (n_gal, 3, 2).
+
+        Parameters
+        ----------
+        centroid : array, shape (n_gal, 2)
+            Pixels from the centre of the stamp, by which the slopes are.
+        """
+        xp = array_namespace(centroid=centroid)
         evens, odds = [], []
         for rows in blocks_in_cache(self.galaxies.re):
             block = self.take(rows)
-            re, im = block.galaxies.shifted(self.grid, self.length * x[rows, :])
+            re, im = block.galaxies.shifted(self.grid, centroid[rows, :])
             evens.append(self.grid.moments(block.weight * re, 2))
             odds.append(self.grid.moments(block.weight * im, 1, 3))
         even, odd = xp.concat(evens), xp.concat(odds)
         odd, cubic = odd[:, :2], odd[:, 2:]
-        scale = self.length * (even[:, 0:1] + even[:, 2:3])
-        inverse = inverse_if_positive(scale)
-        f = odd * inverse
-        # d Im/dx0 = kx Re, and d(scale)/dx0 = -L sum W Im k |k|².
-        slope = xp.stack([even[:, 0:2], even[:, 1:3]], axis=1)
-        scale_slope = -self.length * (cubic[:, 0:2] + cubic[:, 2:4])
-        jac = slope - f[:, :, None] * scale_slope[:, None, :]
-        return f, self.length * jac * inverse[:, :, None]
+        # d Im/dx0 = kx Re, and d(scale)/dx0 = -sum W Im k |k|².
+        slopes = [even[:, 0:2], even[:, 1:3], -(cubic[:, 0:2] + cubic[:, 2:4])]
+        values = xp.concat([odd, even[:, 0:1] + even[:, 2:3]], axis=-1)
+        return values, xp.stack(slopes, axis=1)
 
 
 def starting_centroid(
@@ -76,9 +86,24 @@ def starting_centroid(
 
     Where no centroid is found within `reach` pixels, the centre of the stamp.
     """
-    xp = array_namespace(weight=weight)
     problem = DipoleTests(grid=grid, galaxies=galaxies, weight=weight, length=length)
-    centre = xp.zeros_like(galaxies.re[:, :2])
+    return find_centroid(problem, galaxies.re[:, :2], length, reach=reach)
+
+
+def find_centroid(problem: RootProblem, like: Array, length: float, *, reach: float) -> Array:
+    """Return where dipoles vanish, or the origin where that is not within `reach`.
+
+    Parameters
+    ----------
+    problem : RootProblem
+        In `(x0/L, y0/L)`.
+    like : array, shape (n_gal, 2)
+        Of the library, dtype and device of the result.
+    length : float
+        L.
+    """
+    xp = array_namespace(like=like)
+    centre = xp.zeros_like(like)
     options = DoglegOptions(ftol=1e-2, max_iter=12, initial_radius=2.0, max_radius=8.0)
     found = length * find_root(problem, centre, options=options).x
     near = xp.abs(found) <= reach

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fdnt_xp.arrays import Array, array_namespace, device_of
 from fdnt_xp.nulltests.dogleg import DoglegOptions, RootResult, find_root
-from fdnt_xp.nulltests.tests import inverse_if_positive
+from fdnt_xp.nulltests.scaled import inverse_if_positive
 from fdnt_xp.shapes.laguerre import LaguerreBasis, generators, pixel_positions, position
 from fdnt_xp.shapes.least_squares import LARGEST_INFLATION, LinearFit, least_squares
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import numbers
 from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Final
@@ -171,16 +172,20 @@ def check_stamps(stamps: Array, psf: Psf) -> tuple[ModuleType, Array]:
 
 def check_options(*, size: float | None, padding: int, chunk_size: int | None) -> None:
     """Refuse numbers that mean nothing."""
+    if size is not None and not isinstance(size, numbers.Real):
+        raise FdntTypeError(f"size must be a number, not {size!r}")
     if size is not None and not (math.isfinite(size) and size > 0):
-        raise RangeError("size", size, 0.0, None)
+        raise RangeError("size", float(size), 0.0, None)
     check_count("padding", padding, 1)
     if chunk_size is not None:
         check_count("chunk_size", chunk_size, 1)
 
 
 def check_count(name: str, value: int, least: int) -> None:
-    """Refuse what is not a whole number from `least` up; NaN and infinity neither."""
-    if not math.isfinite(value) or value != int(value) or value < least:
+    """Refuse what is not an integer from `least` up."""
+    if not isinstance(value, numbers.Real) or (isinstance(value, float) and value % 1 == 0):
+        raise FdntTypeError(f"{name} must be an integer, not {value!r}")
+    if not isinstance(value, numbers.Integral) or value < least:
         raise RangeError(name, value, least, None)
 
 

@@ -23,6 +23,7 @@ over x. The transform `integral f(x) exp(-i k.x) d²x` of one is, with `l = sigm
 from __future__ import annotations
 
 import math
+import numbers
 from collections.abc import Iterator
 from dataclasses import dataclass
 from types import ModuleType
@@ -32,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdnt_xp.arrays import Array, array_namespace, device_of
-from fdnt_xp.errors import RangeError
+from fdnt_xp.errors import FdntTypeError, RangeError
 from fdnt_xp.shear import hyperbolic_series, hyperbolic_slopes, shear_matrix
 
 MAX_ORDER: Final = 20
@@ -42,8 +43,10 @@ _FARTHEST: Final = 1e4
 
 
 def check_order(order: int) -> None:
-    """Raise `RangeError` if there is no basis of this order."""
-    if order != int(order) or not 0 <= order <= MAX_ORDER:
+    """Raise `FdntTypeError` or `RangeError` if there is no basis of this order."""
+    if not isinstance(order, numbers.Real) or (isinstance(order, float) and order % 1 == 0):
+        raise FdntTypeError(f"order must be an integer, not {order!r}")
+    if not (isinstance(order, numbers.Integral) and 0 <= order <= MAX_ORDER):
         raise RangeError("order", order, 0, MAX_ORDER)
 
 

@@ -10,7 +10,6 @@ pixels -> transform, divided by T        shapes.sources: of the stamps, or of fi
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from types import ModuleType
 from typing import Final, Literal, TypeAlias
@@ -20,16 +19,8 @@ from fdnt_xp.errors import FdntValueError
 from fdnt_xp.flags import Flag
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.psf import Psf
-from fdnt_xp.nulltests.dogleg import (
-    DoglegOptions,
-    RootResult,
-    Status,
-    default_ftol,
-    find_root,
-    newton_step,
-)
+from fdnt_xp.nulltests.dogleg import RootResult
 from fdnt_xp.nulltests.tests import NullTests
-from fdnt_xp.shapes.centroid import starting_centroid, wide_weight
 from fdnt_xp.shapes.fdnt_gl import fit_pixels_of
 from fdnt_xp.shapes.functionals import N_FUNCTIONALS
 from fdnt_xp.shapes.gl_fit import check_fit_order
@@ -46,8 +37,9 @@ from fdnt_xp.shapes.job import (
 from fdnt_xp.shapes.laguerre import check_order, n_coefficients
 from fdnt_xp.shapes.pixels import Pixels, check_pixels
 from fdnt_xp.shapes.results import ShapeResult
+from fdnt_xp.shapes.search import COARSE_STEPS, FINE_ABOVE, looked_at, solve, squeezed
 from fdnt_xp.shapes.sky import SkyFrame, sky_frame
-from fdnt_xp.shapes.solution import SolutionNoise, describe_with, solution_of
+from fdnt_xp.shapes.solution import describe_with, solution_of
 from fdnt_xp.shapes.sources import (
     FittedStamps,
     Source,
@@ -55,23 +47,10 @@ from fdnt_xp.shapes.sources import (
     WhiteStamps,
     filled_stamps,
 )
-from fdnt_xp.shear import eta_from_matrix, shear_matrix
 
 Transform: TypeAlias = Literal["ft", "gl", "hybrid"]
 TRANSFORMS: Final = ("ft", "gl", "hybrid")
 """Where the transform of a galaxy may come from; see `measure_shapes`."""
-
-_FINE_ABOVE: Final = 1.5
-"""`|eta|` beyond which the weight, squeezed by `exp(-|eta|/2)`, covers few cells of the k grid."""
-
-_COARSE_STEPS: Final = 12
-"""Steps of the root finder on the coarse grid: who converges there needs seldom more than 8."""
-_NEAR: Final = 0.3
-"""Of the root of ftol: a Newton step from there, whose error is a square, meets ftol."""
-_LONGEST: Final = 0.01
-"""Such a step, in units of eta and of L: a longer one is due to a Jacobian that is no guide."""
-_ROUNDING: Final = 10.0
-"""Times ftol: largest test after such a step."""
 
 
 def measure_shapes(
@@ -180,7 +159,7 @@ def measure_shapes(
     seen = psf if sky is None else sky.seen_by(psf)
     fixed = _fixed_size(xp, stamps, size, sky)
     job = prepare(xp, stamps, seen, padding=padding, size=fixed, max_iter=max_iter)
-    n_chunk = chunk_size or _galaxies_at_once(job, pixels, transform, order)
+    n_chunk = chunk_size or galaxies_in_memory(job, pixels, transform, order)
     chunks = job.chunks(n_gal, n_chunk)
     result = ShapeResult.concat(
         [_measure_chunk(job.of(part), pixels.take(part.rows), transform, order) for part in chunks]
@@ -260,7 +239,7 @@ def _measure_source(job: Job, source: Source, pixels: Pixels, flags: Array) -> S
     shape = pixels.stamp_shape
     measurable = xp.bitwise_and(flags, xp.full_like(flags, ~int(Flag.FILLED))) == 0
     # Whoever is not there by then is measured again, and need not hold up a small batch.
-    few = replace(job, max_iter=min(job.max_iter, _COARSE_STEPS))
+    few = replace(job, max_iter=min(job.max_iter, COARSE_STEPS))
     result, root, finer = _measure_on(few, job.coarse, source, shape, flags, last_step_free=True)
     finer = finer & measurable
     # A host read: how many need the fine grid decides the size of that batch.
@@ -304,70 +283,13 @@ def _measure_on(
     tests = NullTests(
         grid=grid, galaxies=galaxies, weight=job.weight, length=job.length, fixed_width=fixed
     )
-    ftol = default_ftol(xp, galaxies.re.dtype)
-    near = _NEAR * math.sqrt(ftol) if last_step_free else ftol
-    root = solve(job, tests, min(stamp_shape), near, known)
-    if last_step_free:
-        step, _ = newton_step(xp, root.f, root.jac)
-        short = root.success & (xp.max(xp.abs(step), axis=-1) <= _LONGEST)
-        root = replace(root, x=xp.where(short[:, None], root.x + step, root.x))
+    root = solve(job, tests, min(stamp_shape), known, last_step_free=last_step_free)
     eta, centroid = solution_of(tests, root)
     noise = source.noise(tests, eta, centroid, inverse_transfer)
     if last_step_free:
-        root = _looked_at(tests, root, noise, _ROUNDING * ftol)
+        root = looked_at(root, *tests.scaled(eta, noise.tests, noise.matched))
     result = describe_with(tests, root, noise, stamp_shape=stamp_shape, flags=flags)
-    return result, root, (_squeezed(eta, job.weight.frame) > _FINE_ABOVE) | ~root.success
-
-
-def _squeezed(eta: Array, frame: Array | None) -> Array:
-    """Return how much narrower than its disc the weight is on the k grid: ln of the ratio.
-
-    `|eta|` on the pixels' own frame: half by the shrink factor, half by the shear.
-    """
-    xp = array_namespace(eta=eta)
-    norm = xp.sqrt(eta[:, 0] ** 2 + eta[:, 1] ** 2)
-    if frame is None:
-        return norm
-    on_grid = eta_from_matrix(xp.matmul(shear_matrix(eta), frame))
-    return 0.5 * (norm + xp.sqrt(on_grid[:, 0] ** 2 + on_grid[:, 1] ** 2))
-
-
-def _looked_at(tests: NullTests, root: RootResult, noise: SolutionNoise, ftol: float) -> RootResult:
-    """Return the roots with the tests evaluated there; those where they do not vanish failed."""
-    xp = array_namespace(x=root.x)
-    f, jac = tests.scaled(root.x[:, :2], noise.tests.tests, noise.tests.matched)
-    # Not `>`: the tests may be NaN.
-    missed = root.success & ~(xp.max(xp.abs(f), axis=-1) <= ftol)
-    status = xp.where(missed, xp.full_like(root.status, int(Status.MAX_ITER)), root.status)
-    return replace(root, f=f, jac=jac, status=status)
-
-
-def solve(
-    job: Job,
-    tests: NullTests,
-    side: int,
-    ftol: float | None = None,
-    known: RootResult | None = None,
-) -> RootResult:
-    """Find the root of the null tests, from one nearby or a round galaxy at its first centroid."""
-    xp = array_namespace(kmax=job.weight.kmax)
-    centre = starting_centroid(
-        tests.grid,
-        tests.galaxies,
-        wide_weight(job.weight, tests.grid, side),
-        job.length,
-        reach=0.5 * side,
-    )
-    start = xp.concat([xp.zeros_like(centre), centre / job.length], axis=-1)
-    if known is not None:
-        start = xp.where(known.success[:, None], known.x, start)
-    options = DoglegOptions(
-        ftol=ftol,
-        max_iter=job.max_iter,
-        initial_radius=1.0,
-        max_radius=3.0,
-    )
-    return find_root(tests, start, options=options)
+    return result, root, (squeezed(eta, job.weight.frame) > FINE_ABOVE) | ~root.success
 
 
 def _check_transform(transform: str, order: int, stamps: Array) -> None:
@@ -381,7 +303,7 @@ def _check_transform(transform: str, order: int, stamps: Array) -> None:
         check_fit_order(order, stamps)
 
 
-def _galaxies_at_once(job: Job, pixels: Pixels, transform: Transform, order: int) -> int:
+def galaxies_in_memory(job: Job, pixels: Pixels, transform: Transform, order: int) -> int:
     """Return how many galaxies fit the memory of a chunk."""
     ny, nx = pixels.stamp_shape
     grid = job.fine if transform == "gl" else job.coarse

@@ -46,6 +46,9 @@ class Pixels:
     def kept(self, keep: Array) -> Pixels:
         """Return the same with stamps of zeros where `keep`, shape (n_gal,), is False."""
         xp = array_namespace(keep=keep)
+        # A host read: a copy of all stamps costs more, and hardly ever is one needed.
+        if bool(xp.all(keep)):
+            return self
         zero = xp.zeros_like(self.stamps)
         return replace(self, stamps=xp.where(keep[:, None, None], self.stamps, zero))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 from fdnt_xp.arrays import Array, array_namespace, device_of, has_any, to_numpy
 from fdnt_xp.flags import FAILED, Flag
@@ -89,7 +89,7 @@ class ShapeResult:
         def code(value: int) -> Array:
             return xp.full((n_gal,), value, dtype=xp.int32, device=device)
 
-        return cls(
+        return ShapeResult(
             eta=nan(2),
             eta_cov=nan(2, 2),
             eg=nan(),
@@ -104,7 +104,7 @@ class ShapeResult:
         )
 
     @classmethod
-    def concat(cls, parts: Sequence[ShapeResult]) -> ShapeResult:
+    def concat(cls, parts: Sequence[Self]) -> Self:
         """Join results, at least one, in the order given."""
         xp = array_namespace(eta=parts[0].eta)
         return cls(
@@ -134,16 +134,16 @@ class ShapeResult:
         """True where the galaxy has a shape, shape (n_gal,), bool."""
         return ~has_any(self.flags, int(FAILED))
 
-    def take(self, rows: Array) -> ShapeResult:
+    def take(self, rows: Array) -> Self:
         """Return the galaxies with the given row numbers (integer array), in that order."""
         xp = array_namespace(eta=self.eta, rows=rows)
-        return ShapeResult(
+        return type(self)(
             **{name: xp.take(column, rows, axis=0) for name, column in self.columns().items()}
         )
 
-    def to_numpy(self) -> ShapeResult:
+    def to_numpy(self) -> Self:
         """Return the same result with NumPy arrays, copied to the host."""
-        return ShapeResult(**{name: to_numpy(column) for name, column in self.columns().items()})
+        return type(self)(**{name: to_numpy(column) for name, column in self.columns().items()})
 
     def columns(self) -> dict[str, Array]:
         """Return the fields that there are, by name."""

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any, Final, Protocol
 
 from fdnt_xp.arrays import Array, array_namespace, device_of, has_any
 from fdnt_xp.flags import FAILED, Flag
 from fdnt_xp.nulltests.dogleg import RootResult, Status, newton_step
 from fdnt_xp.nulltests.gradient import ellipticity_gradient
-from fdnt_xp.nulltests.tests import NullTests, TestNoise
+from fdnt_xp.nulltests.tests import MatchedWidth, NullTests, TestNoise, TestValues
 from fdnt_xp.shapes.results import ShapeResult
 
 _MOST_ELLIPTICAL: Final = 4.0
@@ -23,34 +24,66 @@ _STATUS_FLAGS: Final = {
 }
 
 
+class SolvedTests(Protocol):
+    """What is asked of the tests that were solved; see `NullTests`."""
+
+    @property
+    def length(self) -> float:
+        """L, the unit of centroids."""
+
+    @property
+    def fixed_width(self) -> Array | None:
+        """sigma² where it was given."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class SolutionNoise:
-    """The noise of the tests and of the flux at a solution.
+    """The noise of the tests and of the flux at a solution, and what they are there.
 
     Parameters
     ----------
-    tests : TestNoise
-        For its flux, its tests and its weight; its own covariances are not looked at.
+    tests : TestValues
+    matched : MatchedWidth
+    flux : array, shape (n_gal,)
     covariance : array, shape (n_gal, 4, 4)
         Of (t1, t2, tx, ty), the noise of the size of the weight included; NaN if unknown.
     flux_variance : array, shape (n_gal,)
     """
 
-    tests: TestNoise
+    tests: TestValues
+    matched: MatchedWidth
+    flux: Array
     covariance: Array
     flux_variance: Array
 
     @classmethod
-    def of(cls, tests: TestNoise, covariance: Array) -> SolutionNoise:
+    def of(cls, noise: TestNoise, covariance: Array) -> SolutionNoise:
         """Make it of the covariance of (t1, t2, tx, ty, flux), shape (n_gal, 5, 5)."""
         return cls(
-            tests=tests,
+            tests=noise.tests,
+            matched=noise.matched,
+            flux=noise.flux,
             covariance=covariance[:, :4, :4],
             flux_variance=covariance[:, 4, 4],
         )
 
+    @classmethod
+    def concat(cls, parts: Sequence[SolutionNoise]) -> SolutionNoise:
+        """Join solutions, at least one, in the order given."""
+        return parts[0] if len(parts) == 1 else _joined(parts)
 
-def white_noise(tests: TestNoise, noise_per_mode: Array) -> SolutionNoise:
+
+def _joined(parts: Sequence[Any]) -> Any:
+    """Return the rows of all parts, field by field, of records within records too."""
+    first = parts[0]
+    if is_dataclass(first) and not isinstance(first, type):
+        names = [g.name for g in fields(first)]
+        return replace(first, **{n: _joined([getattr(part, n) for part in parts]) for n in names})
+    xp = array_namespace(first=first)
+    return xp.concat(list(parts), axis=0)
+
+
+def white_noise(noise: TestNoise, noise_per_mode: Array) -> SolutionNoise:
     """Return the noise of the tests where that of the image is white.
 
     Even and odd tests then have none in common.
@@ -60,13 +93,15 @@ def white_noise(tests: TestNoise, noise_per_mode: Array) -> SolutionNoise:
     noise_per_mode : array, shape (n_gal,)
         `n N`: variance of a pixel times the number of pixels of the grid; NaN if unknown.
     """
-    xp = array_namespace(even=tests.even)
-    zero = xp.zeros_like(tests.even)
-    rows = [xp.concat([tests.even, zero], axis=-1), xp.concat([zero, tests.odd], axis=-1)]
+    xp = array_namespace(even=noise.even)
+    zero = xp.zeros_like(noise.even)
+    rows = [xp.concat([noise.even, zero], axis=-1), xp.concat([zero, noise.odd], axis=-1)]
     return SolutionNoise(
-        tests=tests,
+        tests=noise.tests,
+        matched=noise.matched,
+        flux=noise.flux,
         covariance=xp.concat(rows, axis=-2) * noise_per_mode[:, None, None],
-        flux_variance=tests.flux_variance * noise_per_mode,
+        flux_variance=noise.flux_variance * noise_per_mode,
     )
 
 
@@ -95,7 +130,7 @@ def describe(
     return describe_with(tests, root, noise, stamp_shape=stamp_shape, flags=flags)
 
 
-def solution_of(tests: NullTests, root: RootResult) -> tuple[Array, Array]:
+def solution_of(tests: SolvedTests, root: RootResult) -> tuple[Array, Array]:
     """Return eta and the centroid, pixels from the centre of the stamp, at the roots."""
     return root.x[:, :2], tests.length * root.x[:, 2:]
 
@@ -124,22 +159,44 @@ def describe_with(
         What is known of each galaxy so far.
     """
     xp = array_namespace(x=root.x)
+    _, centroid = solution_of(tests, root)
+    ny, nx = stamp_shape
+    off_stamp = (xp.abs(centroid[:, 0]) > 0.5 * nx) | (xp.abs(centroid[:, 1]) > 0.5 * ny)
+    result = describe_at_origin(tests, root, noise, off_stamp=off_stamp, flags=flags)
+    middle = xp.asarray(
+        [0.5 * (nx - 1), 0.5 * (ny - 1)], dtype=root.x.dtype, device=device_of(root.x)
+    )
+    return replace(result, centroid=result.centroid + middle)
+
+
+def describe_at_origin(
+    tests: SolvedTests, root: RootResult, noise: SolutionNoise, *, off_stamp: Array, flags: Array
+) -> ShapeResult:
+    """Return the same with centroids from the origin of the tests.
+
+    Parameters
+    ----------
+    tests : SolvedTests
+        Those that were solved: of stamps, or of sums over them.
+    root, noise, flags
+        As `describe_with` has them.
+    off_stamp : array, shape (n_gal,), bool
+        Where the centroid is not on the stamp.
+    """
+    xp = array_namespace(x=root.x)
     eta, centroid = solution_of(tests, root)
     eta_cov, regular = _eta_covariance(tests, root, noise)
-    matched = noise.tests.matched
-    flux, variance = noise.tests.flux, noise.flux_variance
+    matched = noise.matched
+    flux, variance = noise.flux, noise.flux_variance
     known = variance > 0
     snr = flux / xp.sqrt(xp.where(known, variance, xp.ones_like(variance)))
     snr = xp.where(known, snr, xp.full_like(snr, float("nan")))
 
-    ny, nx = stamp_shape
-    off_x = xp.abs(centroid[:, 0]) > 0.5 * nx
-    off_y = xp.abs(centroid[:, 1]) > 0.5 * ny
     too_elliptical = eta[:, 0] ** 2 + eta[:, 1] ** 2 > _MOST_ELLIPTICAL**2
     reasons = [(flag, root.status == int(status)) for status, flag in _STATUS_FLAGS.items()]
     reasons += [
         (Flag.SINGULAR, root.success & ~regular),
-        (Flag.CENTROID_OFF_STAMP, off_x | off_y),
+        (Flag.CENTROID_OFF_STAMP, off_stamp),
         (Flag.TOO_ELLIPTICAL, root.success & too_elliptical),
         (Flag.NO_SIGNAL, root.success & ~(flux > 0)),
     ]
@@ -150,7 +207,6 @@ def describe_with(
     information = Flag.SIZE_AT_BOUND if tests.fixed_width is None else Flag.SIZE_FIXED
     informed = matched.at_bound if tests.fixed_width is None else measured
     flags = _raised(flags, information, measured & informed)
-    middle = (xp.full_like(flux, 0.5 * (nx - 1)), xp.full_like(flux, 0.5 * (ny - 1)))
 
     def where_measured(values: Array) -> Array:
         """Return the values, NaN where the galaxy has no shape."""
@@ -159,9 +215,9 @@ def describe_with(
 
     return ShapeResult(
         eta=where_measured(eta),
-        eg=where_measured(ellipticity_gradient(eta, noise.tests.tests, matched, tests.length)),
+        eg=where_measured(ellipticity_gradient(eta, noise.tests, matched, tests.length)),
         eta_cov=where_measured(eta_cov),
-        centroid=where_measured(centroid + xp.stack(middle, axis=-1)),
+        centroid=where_measured(centroid),
         size=where_measured(xp.sqrt(matched.width)),
         flux=where_measured(flux),
         snr=where_measured(snr),
@@ -172,7 +228,7 @@ def describe_with(
 
 
 def _eta_covariance(
-    tests: NullTests, root: RootResult, noise: SolutionNoise
+    tests: SolvedTests, root: RootResult, noise: SolutionNoise
 ) -> tuple[Array, Array]:
     """Return `J⁻¹ Cov(f) J⁻ᵀ` of eta, and where J is regular.
 
@@ -189,13 +245,13 @@ def _eta_covariance(
         regular = regular & solved
     # Rows 0 and 1 of J⁻¹, column by column.
     to_eta = xp.stack(inverse, axis=-1)[:, :2, :]
-    scale = noise.tests.tests.values[:, 4]
+    scale = noise.tests.values[:, 4]
     safe = xp.where(scale > 0, scale, xp.ones_like(scale))[:, None, None]
     to_eta = xp.concat([to_eta[:, :, :2], to_eta[:, :, 2:] / tests.length], axis=-1) / safe
-    return _sandwich(to_eta, noise.covariance), regular
+    return sandwich(to_eta, noise.covariance), regular
 
 
-def _sandwich(a: Array, c: Array) -> Array:
+def sandwich(a: Array, c: Array) -> Array:
     """Return `A C Aᵀ` for stacks of small matrices, as sums of products."""
     xp = array_namespace(a=a)
     ac = xp.sum(a[:, :, :, None] * c[:, None, :, :], axis=2)

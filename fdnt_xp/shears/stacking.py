@@ -42,8 +42,8 @@ from fdnt_xp.shapes.job import (
     prepare,
     screen,
 )
-from fdnt_xp.shapes.measure import solve
 from fdnt_xp.shapes.results import ShapeResult
+from fdnt_xp.shapes.search import solve
 from fdnt_xp.shapes.solution import describe
 from fdnt_xp.shear import reduced_shear_from_eta
 from fdnt_xp.shears.estimate import ShearEstimate
