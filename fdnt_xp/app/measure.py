@@ -17,7 +17,7 @@ from fdnt_xp.data.provenance import Value, provenance
 from fdnt_xp.data.stamps import StampSource, cube_stamps, grid_stamps, position_stamps
 from fdnt_xp.data.tables import read_positions
 from fdnt_xp.errors import CatalogError, FdntValueError
-from fdnt_xp.shapes.methods import shape_method
+from fdnt_xp.shapes.methods import method_in_noise, shape_method
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -165,6 +165,9 @@ def measure_files(inputs: Inputs, settings: Settings) -> tuple[Table, float]:
     ivar = None
     if mask is not None or weight is not None:
         ivar = IvarSource(mask=mask, weight=weight, variance=noise.variance)
+    coloured = None
+    if noise.power is not None and ivar is None:
+        coloured = method_in_noise(settings.method, backend.from_numpy(noise.power))
     start = time.perf_counter()
     if settings.responses:
         table = measure_source_responses(
@@ -183,8 +186,8 @@ def measure_files(inputs: Inputs, settings: Settings) -> tuple[Table, float]:
             source,
             psf_pixels,
             backend=backend,
-            method=method,
-            noise_variance=noise.variance,
+            method=coloured or method,
+            noise_variance=None if coloured else noise.variance,
             ivar=ivar,
             oversampling=settings.oversampling,
             size=settings.size,
@@ -192,7 +195,14 @@ def measure_files(inputs: Inputs, settings: Settings) -> tuple[Table, float]:
             quiet=settings.quiet,
         )
     seconds = time.perf_counter() - start
-    table.meta = _facts(inputs, settings, backend, noise, table.meta.get("RSTEP"))
+    table.meta = _facts(
+        inputs,
+        settings,
+        backend,
+        noise,
+        table.meta.get("RSTEP"),
+        noise.power is not None if settings.responses else (coloured is not None) or None,
+    )
     return table, seconds
 
 
@@ -204,7 +214,12 @@ def _open_beside(source: StampSource, path: str | None, what: str) -> StampSourc
 
 
 def _facts(
-    inputs: Inputs, settings: Settings, backend: Backend, noise: Noise, step: float | None
+    inputs: Inputs,
+    settings: Settings,
+    backend: Backend,
+    noise: Noise,
+    step: float | None,
+    correlated: bool | None,
 ) -> dict[str, Value]:
     """Return the header of the catalog."""
     positions = inputs.layout == "positions"
@@ -230,7 +245,7 @@ def _facts(
         noiseimg=inputs.noise_image,
         maskimg=inputs.mask,
         ivarimg=inputs.weight,
-        noisecor=noise.power is not None if settings.responses else None,
+        noisecor=correlated,
         bordlvl=noise.border.level if noise.border else None,
         wtsize=settings.size,
         chunk=settings.chunk,

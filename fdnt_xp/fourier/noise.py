@@ -82,6 +82,25 @@ class PixelNoise:
             correlation = rows_of(correlation, rows)
         return PixelNoise(variance=rows_of(self.variance, rows), correlation=correlation)
 
+    def without_window(self) -> PixelNoise:
+        """Return the noise as it is on a plane without end.
+
+        A stamp of n pixels has `n - |lag|` pairs of pixels at a lag, along each axis: so
+        much less of a correlation is in its periodogram, and in the correlation function that
+        is made of it. Lags beyond half a stamp, of which there is no telling, are taken for
+        none.
+        """
+        if self.correlation is None:
+            return self
+        xp = array_namespace(correlation=self.correlation)
+        like = {"dtype": self.correlation.dtype, "device": device_of(self.correlation)}
+        along_y, along_x = (
+            1.0 - xp.abs(xp.arange(n, **like) - float(n // 2)) / n
+            for n in (int(size) for size in self.correlation.shape[1:])
+        )
+        pairs = along_y[:, None] * along_x[None, :]
+        return replace(self, correlation=self.correlation / pairs)
+
     @property
     def shared(self) -> bool:
         """Whether all galaxies have noise of one shape, whatever its variance."""

@@ -7,17 +7,12 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import Final, Literal, TypeAlias
 
-from fdnt_xp.arrays import Array, array_namespace, as_floating, device_of, require_dtype
-from fdnt_xp.errors import (
-    FdntTypeError,
-    FdntValueError,
-    RangeError,
-    ShapeMismatchError,
-)
+from fdnt_xp.arrays import Array, array_namespace, device_of
+from fdnt_xp.errors import FdntTypeError, FdntValueError, RangeError, ShapeMismatchError
 from fdnt_xp.fourier.noise import PixelNoise
 from fdnt_xp.fourier.psf import Psf
 from fdnt_xp.shapes.job import check_count, check_options, check_stamps, galaxies_at_once, prepare
-from fdnt_xp.shapes.pixels import noise_column
+from fdnt_xp.shapes.pixels import noise_column, power_noise
 from fdnt_xp.shears.counter_shear import FrozenQuadrupole, SolvedEta, Statistic
 from fdnt_xp.shears.frames import FrameSample, SampleNoise
 from fdnt_xp.shears.masks import Masked, SampleMask
@@ -143,7 +138,7 @@ def _sample_noise(xp: ModuleType, stamps: Array, options: NoiseOptions) -> Sampl
     if options.noise_variance is not None and options.noise_power is not None:
         raise FdntValueError("give noise_variance or noise_power, not both")
     if options.noise_power is not None:
-        pixels = _correlated(xp, stamps, options.noise_power)
+        pixels = power_noise(xp, stamps, options.noise_power)
     elif options.noise_variance is None:
         if options.isotropise:
             raise FdntValueError("isotropise needs noise_variance or noise_power")
@@ -179,29 +174,6 @@ def _variances(xp: ModuleType, stamps: Array, given: float | Array) -> Array | N
     if not bool(xp.all(xp.isfinite(variance) & (variance >= 0))):
         raise FdntValueError("noise_variance must be finite and not negative, for each galaxy")
     return variance if bool(xp.any(variance > 0)) else None
-
-
-def _correlated(xp: ModuleType, stamps: Array, power: Array) -> PixelNoise:
-    """Return the noise of a power spectrum, checked."""
-    array_namespace(stamps=stamps, noise_power=power)
-    power = as_floating(xp, power, "noise_power")
-    require_dtype(stamps.dtype, noise_power=power)
-    n_gal, ny, nx = (int(n) for n in stamps.shape)
-    if power.shape not in ((ny, nx), (n_gal, ny, nx)):
-        raise ShapeMismatchError(
-            f"noise_power must have the shape ({ny}, {nx}) or ({n_gal}, {ny}, {nx}), "
-            f"not {tuple(power.shape)}"
-        )
-    power = xp.reshape(power, (-1, ny, nx))
-    if not bool(xp.all(xp.isfinite(power) & (power >= 0)) & xp.any(power > 0)):
-        raise FdntValueError("noise_power must be finite, not negative, and not all 0")
-    # -k is at the index (-j) mod n, along both axes.
-    mirrored = xp.roll(xp.flip(power, axis=(-2, -1)), (1, 1), axis=(-2, -1))
-    if not bool(xp.all(xp.abs(power - mirrored) <= 1e-3 * xp.max(power))):
-        raise FdntValueError(
-            "noise_power must be the same at k and -k, in the order of the FFT (k = 0 first)"
-        )
-    return PixelNoise.of_power(power, n_gal)
 
 
 def _whole_numbers(xp: ModuleType, stamps: Array, name: str, given: Array | None) -> Array | None:
