@@ -255,7 +255,7 @@ def test_shapes_in_correlated_noise(method, folder, drawn):
     else:
         assert header["NOISECOR"] is True
         whole = method_in_noise(method, noise.power)(stamps, psf)
-    np.testing.assert_allclose(table["eta1_err"], np.sqrt(whole.eta_cov[:, 0, 0]), rtol=1e-6)
+    np.testing.assert_allclose(table["eta1_var"], whole.eta_cov[:, 0, 0], rtol=1e-6)
 
 
 def test_a_cube_of_blank_stamps_and_plain_shapes(folder):
