@@ -15,6 +15,7 @@ from fdnt_xp.fourier.transform import DeconvolvedStamps
 from fdnt_xp.nulltests.dogleg import DoglegOptions, find_root
 from fdnt_xp.nulltests.tests import inverse_if_positive
 from fdnt_xp.nulltests.weights import Weight
+from fdnt_xp.shear import shear_matrix
 
 _WIDE: Final = 0.125
 """Size of the weight of the first centroid, in sides of the stamp: it reaches a third of it."""
@@ -43,7 +44,9 @@ class DipoleTests:
         """Return the problem of the given galaxies."""
         shared = int(self.weight.shape[0]) == 1
         weight = self.weight if shared else rows_of(self.weight, rows)
-        return replace(self, galaxies=self.galaxies.take(rows), weight=weight)
+        return replace(
+            self, grid=self.grid.take(rows), galaxies=self.galaxies.take(rows), weight=weight
+        )
 
     def evaluate(self, x: Array) -> tuple[Array, Array]:
         """Return `sum W Im I~ k / (L sum W Re I~ |k|²)` and its Jacobian by x0/L.
@@ -96,12 +99,18 @@ def wide_weight(
         Shorter side of the stamps, pixels.
     applied_shear : array, shape (2,), optional
         Makes the weight round in the frame from which this eta is taken off: the null of
-        its dipole then follows that shear. By default it is round on the image.
+        its dipole then follows that shear. By default it is round on the image, or, where the
+        weight has a frame, on the sky.
     """
     xp = array_namespace(kmax=weight.kmax)
     shrink = xp.ones_like(weight.kmax)
     if applied_shear is not None:
-        grid = grid.sheared(applied_shear)
+        if weight.frame is None:
+            grid = grid.sheared(applied_shear)
+        else:
+            weight = replace(
+                weight, frame=xp.matmul(shear_matrix(applied_shear)[None, :, :], weight.frame)
+            )
         # As in the null tests: the weight may not reach out of the disc.
         shrink = shrink * xp.exp(0.5 * xp.sqrt(xp.sum(applied_shear**2)))
     return weight.round_window(grid, _WIDE * side, shrink)

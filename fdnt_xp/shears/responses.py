@@ -238,7 +238,7 @@ def _result(sample: FrameSample, step: float) -> ResponseResult:
     return ResponseResult(
         v=or_nan(seen[0].v),
         response=or_nan(xp.stack(slopes, axis=-1)),
-        centroid=or_nan(sample.job.length * seen[0].solution[:, -2:] + middle),
+        centroid=or_nan(seen[0].centroid + middle),
         flags=flags,
         step=step,
         **quantities,
