@@ -31,8 +31,16 @@ from fdnt_xp.app.great08_run import MeasureReport, measure_challenge
 from fdnt_xp.app.great08_simulate import run_simulate
 from fdnt_xp.app.numbers import write_json
 from fdnt_xp.data.catalog import read_catalog
-from fdnt_xp.data.simulate import NOISE_SIGMA, great08_image
+from fdnt_xp.data.simulate import (
+    NOISE_SIGMA,
+    PSF_BETA,
+    PSF_FWHM,
+    PSF_G,
+    PSF_TRUNCATION,
+    great08_image,
+)
 from fdnt_xp.great08.answers import Answers, match_answers, pooled
+from fdnt_xp.great08.moffat import MoffatPsf
 from fdnt_xp.great08.score import Score, score_answers
 from fdnt_xp.great08.sets import Simulation, make_simulation
 from fdnt_xp.great08.submission import read_submission
@@ -50,6 +58,8 @@ METHODS = (
     "exponential",
     "devaucouleurs",
 )
+STAR = 4
+"""Pixels of the star in a pixel, for the part truncation."""
 PARTS = ("cells", "estimators", "methods", "real-noise", "truncation", "responsivity")
 
 
@@ -189,7 +199,9 @@ def truncation() -> None:
             drawn = great08_image(n_x=n, n_y=n, cell=cell, shear=(shear, 0.0), snr=None, seed=5)
             stamps = drawn.image.reshape(n, cell, n, cell).transpose(0, 2, 1, 3)
             stamps = stamps.reshape(n * n, cell, cell)
-            psf = fdnt_xp.Psf.from_image(drawn.psf_image)
+            # A star in pixels as large as those of the galaxies has m = -2e-4 of its own.
+            star = MoffatPsf(beta=PSF_BETA, fwhm=PSF_FWHM, g=PSF_G, trunc=PSF_TRUNCATION * PSF_FWHM)
+            psf = fdnt_xp.Psf.from_image(star.draw(cell, STAR), oversampling=STAR)
             null = fdnt_xp.population_null(
                 stamps, psf, noise_variance=NOISE_SIGMA**2, isotropise=False
             )

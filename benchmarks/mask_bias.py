@@ -28,12 +28,12 @@ from fdnt_xp.data.versions import Population, draw_versions
 from fdnt_xp.fourier.missing import fill_missing
 from fdnt_xp.fourier.psf import Psf
 from fdnt_xp.shapes.gl_fit import filled, fit_laguerre
-from fdnt_xp.shears.sample import NoiseOptions, make_sample
+from fdnt_xp.shears.sample import NoiseOptions, default_size, make_sample
 
 HOLES = ("random 1 %", "random 5 %", "cosmic ray", "column", "far column", "corner")
 TREATMENTS = ("zero", "neighbours", "opposite", "fourfold", "laguerre", "fill")
 BATCH, STEP = 512, 0.02
-FOOTPRINT = 10.5
+FOOTPRINT = 5.0  # of the weight as it is on the image, as the null has it
 SYMMETRY = np.repeat([0, 1, 4, 5], BATCH)
 
 
@@ -65,6 +65,7 @@ def treated(
     psf: Psf,
     variance: float,
     noise: np.ndarray,
+    size: float,
 ) -> np.ndarray:
     """Return stamps with something in their holes; `noise` is more of it, of unit variance."""
     if treatment == "neighbours":
@@ -81,14 +82,16 @@ def treated(
         model = filled(stamps, ivar, fit)
         # Pixels without noise would be another kind of hole.
         model = model + np.where(mask, math.sqrt(variance) * noise, 0.0)
-        return np.where(np.isnan(model), treated(stamps, mask, "fill", psf, variance, noise), model)
+        instead = treated(stamps, mask, "fill", psf, variance, noise, size)
+        return np.where(np.isnan(model), instead, model)
     if treatment == "fourfold":
         mask = np.any([np.rot90(mask, k, axes=(1, 2)) for k in range(4)], axis=0)
     if treatment == "fill":
         # As the null does: what is far from the middle does not matter, and is not filled.
         stamps = np.where(mask, 0.0, stamps)
         x = np.arange(mask.shape[-1]) - 0.5 * (mask.shape[-1] - 1)
-        near = x[:, None] ** 2 + x**2 <= FOOTPRINT**2
+        footprint = FOOTPRINT * math.hypot(size, 3.0 / psf.largest_kmax)
+        near = x[:, None] ** 2 + x**2 <= footprint**2
         parts = range(0, len(stamps), 256)
         return np.concatenate(
             [fill_missing(stamps[i : i + 256], mask[i : i + 256] & near, psf) for i in parts]
@@ -107,6 +110,8 @@ def measure(kind: str, treatment: str, snr: float, n_stamps: int) -> dict[str, A
     psf = Psf.from_image(versions.psf_images[0])
     sigma = math.sqrt(np.mean(np.sum(versions.stamps**2, axis=(-2, -1)))) / snr
     gamma = 2.0 * math.atanh(population.shear)
+    whole = versions.stamps[:, 0, 0]
+    size = default_size(whole, psf, noise_variance=sigma**2)
     means, slopes = [], []
     for number in range(max(2, math.ceil(n_stamps / (8 * BATCH)))):
         rng = np.random.default_rng([7, number, HOLES.index(kind)])
@@ -131,14 +136,15 @@ def measure(kind: str, treatment: str, snr: float, n_stamps: int) -> dict[str, A
                 identifiers=names,
                 symmetry=SYMMETRY,
                 seed=1,
+                size=size,
                 softening=1.0,
             )
             sample = make_sample(
-                treated(clean + noise, mask, treatment, psf, sigma**2, more),
+                treated(clean + noise, mask, treatment, psf, sigma**2, more, size),
                 psf,
                 statistic="frozen",
                 weight=None,
-                size=None,
+                size=size,
                 softening=1.0,
                 max_shear=0.1,
                 padding=1,

@@ -31,6 +31,7 @@ def known(scale, seed, *, sign=1, softening=1.0, bound=0.0):
         identifiers=np.arange(4) + 10 * seed,
         symmetry=np.full(4, 0 if sign > 0 else 4),
         seed=3,
+        size=1.5,
         softening=softening,
         bound=bound,
     )
@@ -43,7 +44,7 @@ def measured(one):
         one.psf,
         statistic="frozen",
         weight=None,
-        size=None,
+        size=one.size,
         softening=one.softening,
         bound=one.bound,
         max_shear=0.1,

@@ -259,7 +259,10 @@ def test_the_error_that_the_noise_power_brings():
     told = [
         fx.population_null(stamps, psf, noise_variance=variance * factor).g for factor in (0.8, 1.2)
     ]
-    np.testing.assert_allclose(estimate.g_err_noise_power, np.abs(told[1] - told[0]) / 2, rtol=0.3)
+    moved = np.abs(told[1] - told[0]) / 2
+    # One component is next to nothing: what the search leaves of it is seen there.
+    left = 0.1 * np.max(moved)
+    np.testing.assert_allclose(estimate.g_err_noise_power, moved, rtol=0.3, atol=left)
     none = fx.population_null(stamps, psf, noise_variance=variance)
     assert none.g_err_noise_power is None
     assert set(estimate.to_dict()) - set(none.to_dict()) == {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +16,11 @@ from fdnt_xp.data.images import Pixels
 from fdnt_xp.data.stamps import StampChunk, StampSource
 from fdnt_xp.errors import FdntValueError, FdntWarning
 from fdnt_xp.fourier.psf import Psf
-from fdnt_xp.shears.responses import measure_responses
-from fdnt_xp.shears.sample import default_size
+from fdnt_xp.shears.responses import STEP, measure_responses
+from fdnt_xp.shears.sample import default_size, rows_for_size
 
 if TYPE_CHECKING:
     from astropy.table import Table
-
-_PSFS_AT_ONCE: Final = 256
 
 
 def measure_source_responses(
@@ -42,7 +40,7 @@ def measure_source_responses(
     Parameters
     ----------
     source, psf_pixels, backend, oversampling, size, chunk, quiet
-        As for `measure_source`; without `size`, one weight fits all PSFs.
+        As for `measure_source`; without `size`, one weight fits all galaxies.
     noise : Noise
         Of the pixels.
     seed : int
@@ -66,16 +64,14 @@ def measure_source_responses(
         )
     names = galaxy_numbers(source.ids)
     psfs = ChunkPsfs.of(psf_pixels, source, backend, oversampling)
-    size = size or _common_size(psfs, source.n_gal)
+    size = size or _size_for_all(source, psfs, noise)
 
     def measure(part: StampChunk, stamps: Array, psf: Psf) -> Table:
         xp = array_namespace(stamps=stamps)
-        power = noise.power
         return measure_responses(
             stamps,
             psf,
-            noise_variance=noise.variance if power is None else None,
-            noise_power=None if power is None else backend.from_numpy(power),
+            **_as_options(noise, backend),
             seed=seed,
             identifiers=xp.asarray(names[part.rows], dtype=xp.int64, device=device_of(stamps)),
             size=size,
@@ -112,9 +108,18 @@ def _hash(name: Any) -> int:
     return int.from_bytes(digest, "big") >> 1
 
 
-def _common_size(psfs: ChunkPsfs, n_gal: int) -> float | None:
-    """Return the default size for all PSFs together, which no chunk of them knows."""
-    if psfs.common is not None or n_gal == 0:
+def _size_for_all(source: StampSource, psfs: ChunkPsfs, noise: Noise) -> float | None:
+    """Return the default size for all galaxies together, which no chunk of them knows."""
+    if source.n_gal == 0:
         return None
-    starts = range(0, n_gal, _PSFS_AT_ONCE)
-    return min(default_size(psfs.rows(slice(start, start + _PSFS_AT_ONCE))) for start in starts)
+    rows = rows_for_size(source.n_gal)
+    stamps = psfs.backend.from_numpy(source.take(np.arange(source.n_gal)[rows]))
+    options = _as_options(noise, psfs.backend)
+    return default_size(stamps, psfs.rows(rows), max_shear=STEP, **options)
+
+
+def _as_options(noise: Noise, backend: Backend) -> dict[str, Any]:
+    """Return the noise as `measure_responses` wants it."""
+    if noise.power is None:
+        return {"noise_variance": noise.variance}
+    return {"noise_power": backend.from_numpy(noise.power)}

@@ -49,7 +49,7 @@ class KnownNoise:
     identifiers, symmetry : array of int64, shape (n_gal,)
     seed : int
         Of the synthetic noise, as `population_null` is told.
-    softening, bound, max_shear, padding
+    size, softening, bound, max_shear, padding
         Of `population_null`; for `measure_responses` its step is the reach.
     """
 
@@ -60,6 +60,7 @@ class KnownNoise:
     identifiers: NDArray[np.int64]
     symmetry: NDArray[np.int64]
     seed: int
+    size: float | None = None
     softening: float = 1.0
     bound: float = 0.0
     max_shear: float = 0.1
@@ -85,7 +86,7 @@ def second_order(known: KnownNoise, gamma: Gamma) -> Real:
         known.psf,
         statistic="frozen",
         weight=None,
-        size=None,
+        size=known.size,
         softening=known.softening,
         bound=known.bound,
         max_shear=known.max_shear,

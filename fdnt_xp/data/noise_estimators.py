@@ -25,12 +25,11 @@ from fdnt_xp.shears.estimate import ShearEstimate
 from fdnt_xp.shears.from_responses import shear_from_responses
 from fdnt_xp.shears.from_shapes import shear_from_shapes
 from fdnt_xp.shears.population import population_null
-from fdnt_xp.shears.responses import measure_responses
+from fdnt_xp.shears.responses import STEP, measure_responses
 from fdnt_xp.shears.sample import default_size
 
 MAX_SHEAR: Final = 0.1
 """Of the nulls, unless a batch wants more: for their control that makes no difference."""
-RESPONSE_STEP: Final = 0.01
 _FOR_RESPONSE: Final = 256
 """Galaxies whose mean response scales the control variate."""
 
@@ -142,7 +141,6 @@ def _responses(stamps: NoisyStamps, settings: Settings) -> Found:
         seed=stamps.seed,
         softening=settings.softening,
         bound=settings.bound,
-        step=RESPONSE_STEP,
         padding=settings.padding,
         **numbers,
     )
@@ -170,7 +168,7 @@ def _null_control(stamps: NoisyStamps, settings: Settings) -> NDArray[np.float64
 
 def _responses_control(stamps: NoisyStamps, settings: Settings) -> NDArray[np.float64]:
     """Return the control variate in the frame of the image."""
-    return _control(stamps, settings, 0.0, reach=RESPONSE_STEP)
+    return _control(stamps, settings, 0.0, reach=STEP)
 
 
 def _control(
@@ -183,6 +181,14 @@ def _control(
     """
     psf = settings.host_psf
     psf = psf if psf.n_psf == 1 else psf.with_index(stamps.psf_of)
+    # Of the galaxies without noise: a size that knew the noise would correlate with it.
+    size = default_size(
+        stamps.clean,
+        psf,
+        noise_variance=stamps.variance,
+        max_shear=reach,
+        padding=settings.padding,
+    )
     known = KnownNoise(
         clean=stamps.clean,
         noise=stamps.pixels - stamps.clean,
@@ -191,6 +197,7 @@ def _control(
         identifiers=stamps.identifiers,
         symmetry=stamps.symmetry,
         seed=stamps.seed,
+        size=size,
         softening=settings.softening,
         bound=settings.bound,
         max_shear=reach,
@@ -204,7 +211,7 @@ def _control(
         isotropise=False,
         softening=settings.softening,
         bound=settings.bound,
-        size=default_size(psf),
+        size=size,
         padding=settings.padding,
     )
     control = np.mean(second_order(known, (2.0 * math.atanh(shear), 0.0)), axis=0)

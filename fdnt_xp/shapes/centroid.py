@@ -57,9 +57,9 @@ class DipoleTests:
         evens, odds = [], []
         for rows in blocks_in_cache(self.galaxies.re):
             block = self.take(rows)
-            re, im = block.galaxies.shifted(self.grid, self.length * x[rows, :])
-            evens.append(self.grid.moments(block.weight * re, 2))
-            odds.append(self.grid.moments(block.weight * im, 1, 3))
+            re, im = block.galaxies.shifted(block.grid, self.length * x[rows, :])
+            evens.append(block.grid.moments(block.weight * re, 2))
+            odds.append(block.grid.moments(block.weight * im, 1, 3))
         even, odd = xp.concat(evens), xp.concat(odds)
         odd, cubic = odd[:, :2], odd[:, 2:]
         scale = self.length * (even[:, 0:1] + even[:, 2:3])

@@ -114,11 +114,12 @@ class Job:
         size = _of_rows(self.size, chunk.rows)
         return replace(self, psf=psf, weight=self.weight.take(number), size=size)
 
-    def first(self, n_gal: int) -> Job:
-        """Return the job of the first galaxies."""
+    def some(self, rows: Rows) -> Job:
+        """Return the job of the given galaxies; PSFs that galaxies share stay shared."""
         if self.psf.index is None:
-            return self.take(slice(0, n_gal))
-        return replace(self, psf=replace(self.psf, index=self.psf.index[:n_gal]))
+            return self.take(rows)
+        psf = replace(self.psf, index=rows_of(self.psf.index, rows))
+        return replace(self, psf=psf, size=_of_rows(self.size, rows))
 
     def take(self, rows: Rows) -> Job:
         """Return the job of the given galaxies, with a PSF for each where there are several."""

@@ -18,8 +18,8 @@ from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.noise import DeconvolvedNoise, PixelNoise, RoundNoise
 from fdnt_xp.fourier.sky_grid import SkyGrid
 from fdnt_xp.fourier.transform import DeconvolvedStamps, deconvolve
-from fdnt_xp.shapes.centroid import starting_centroid, wide_weight
 from fdnt_xp.nulltests.weights import Weight
+from fdnt_xp.shapes.centroid import starting_centroid, wide_weight
 from fdnt_xp.shapes.job import Chunk, Job, in_order, screen
 from fdnt_xp.shear import shear_matrix
 from fdnt_xp.shears.counter_shear import FrameNoise, FrameValues, Statistic, in_new_frame
@@ -102,6 +102,8 @@ class FrameSample:
     mask : SampleMask, optional
     regular : array, shape (1,) or (n_gal,), bool, optional
         Where the Jacobian of a galaxy is one, if they have Jacobians.
+    unit_length : float
+        On the sky, of the lengths that the frames work in; quantities are in that of the sky.
     """
 
     stamps: Array
@@ -112,6 +114,7 @@ class FrameSample:
     noise: SampleNoise | None = None
     mask: SampleMask | None = None
     regular: Array | None = None
+    unit_length: float = 1.0
     _solutions: dict[int, tuple[Gamma, Array]] = field(default_factory=dict)
     """Of each chunk, by its number: the last frame and the unknowns that were solved there,
     the start of the next."""
@@ -123,18 +126,18 @@ class FrameSample:
         """Number of galaxies."""
         return int(self.stamps.shape[0])
 
-    def first(self, n_gal: int) -> FrameSample:
-        """Return the first galaxies as a sample of its own."""
-        rows = slice(0, n_gal)
+    def take(self, rows: Rows) -> FrameSample:
+        """Return the given galaxies as a sample of its own."""
         return FrameSample(
-            stamps=self.stamps[rows, :, :],
-            job=self.job.first(n_gal),
+            stamps=rows_of(self.stamps, rows),
+            job=self.job.some(rows),
             statistic=self.statistic,
             reach=self.reach,
             chunk_size=self.chunk_size,
             noise=None if self.noise is None else self.noise.take(rows),
             mask=None if self.mask is None else self.mask.take(rows),
             regular=None if self.regular is None else _of_rows(self.regular, rows),
+            unit_length=self.unit_length,
         )
 
     def told_of_noise(self, factor: float) -> FrameSample:
@@ -158,7 +161,6 @@ class FrameSample:
         return self.job.chunks(self.n_gal, self.chunk_size)
 
     def _evaluate_chunk(self, number: int, gammas: Sequence[Gamma]) -> Iterator[SampleValues]:
-        xp = array_namespace(stamps=self.stamps)
         chunk = self._chunks[number]
         job = self.job.of(chunk)
         grid = job.coarse
@@ -183,7 +185,7 @@ class FrameSample:
             values = self.statistic.evaluate(sheared, seen, weight, start, frame_noise)
             frame, start = gamma, values.solution
             centroid = job.length * sheared.on_stamp(values.solution[:, -2:])
-            yield _withdrawn(values, flags, centroid)
+            yield _withdrawn(values, flags, centroid, self.unit_length)
         if frame is not None:
             self._solutions[number] = (frame, start)
 
@@ -265,7 +267,9 @@ def _of_rows(column: Array, rows: Rows) -> Array:
     return column if int(column.shape[0]) == 1 else rows_of(column, rows)
 
 
-def _withdrawn(values: FrameValues, flags: Array, centroid: Array) -> SampleValues:
+def _withdrawn(
+    values: FrameValues, flags: Array, centroid: Array, unit_length: float
+) -> SampleValues:
     """Return the values with those of unusable galaxies withdrawn."""
     xp = array_namespace(flags=flags)
     usable = ~has_any(flags, int(FAILED))
@@ -277,6 +281,7 @@ def _withdrawn(values: FrameValues, flags: Array, centroid: Array) -> SampleValu
         return xp.where(usable[:, None], pair, xp.zeros_like(pair))
 
     quantities = {name: masked(getattr(values.quantities, name)) for name in QUANTITIES}
+    quantities["size"] = unit_length * quantities["size"]
     variance = values.v_variance
     return SampleValues(
         v=or_zero(values.v),

@@ -67,6 +67,7 @@ def population_null(
     softening: float = 1.0,
     bound: float = 0.0,
     max_shear: float | None = None,
+    jacobian: Array | None = None,
     padding: int = 1,
     chunk_size: int | None = None,
 ) -> ShearEstimate:
@@ -119,9 +120,10 @@ def population_null(
         `w(|eta|)` that bounds the influence of elongated galaxies; for "eta" alone. Uniform
         by default; where the noise is given, `ShapeWeight.bisquare(1.5)`.
     size : float, optional
-        sigma of the Gaussian part of the weight, pixels. Of the "frozen" weight by default
-        about 1.5 times the size of the PSF, one for the whole sample; for "eta" by default
-        matched to each galaxy, and where the noise is given that of "frozen".
+        sigma of the Gaussian part of the weight, pixels; one for the whole sample. Where the
+        noise is given it is by default that of a typical galaxy of the sample: see
+        `fdnt_xp.shears.sample.default_size`. Without noise it is that of the PSF for "frozen",
+        and matched to each galaxy for "eta".
     softening : float
         Of "frozen": see `FrozenQuadrupole`. 8 weighs a sample of many fluxes better and is
         more sensitive to an error of the noise power.
@@ -132,6 +134,9 @@ def population_null(
         Largest `|g|` in reach. The weight's disc is smaller than the PSF's by
         `sqrt((1 + max_shear)/(1 - max_shear))`, which costs resolution. By default 0.1, and
         0.3, the most that can be, where the shear turns out to be larger.
+    jacobian : array, shape (2, 2) or (n_gal, 2, 2), optional
+        `d(u, v)/d(x, y)` of the pixels, for all stamps or for each, as for `measure_shapes`: shear,
+        weight and noise made round are then those on the sky, `size` and sizes in its unit.
     padding, chunk_size : int
         As for `measure_shapes`.
 
@@ -193,6 +198,7 @@ def population_null(
             noise=noise,
             mask=mask,
             masked=masked,
+            jacobian=jacobian,
         )
         if sample.n_gal < 2:
             raise FdntValueError(f"stamps holds {sample.n_gal} galaxies; a null needs two")
@@ -223,7 +229,7 @@ class _Null:
         xp = array_namespace(stamps=sample.stamps)
         origin = (0.0, 0.0)
         if sample.n_gal >= 4 * _PILOT:
-            pilot = replace(self, sample=sample.first(_PILOT))
+            pilot = replace(self, sample=sample.take(slice(0, _PILOT)))
             origin, _, _ = pilot.find(origin)
         gamma, v, response = self.find(origin)
         counted, total = v.counted, v.values.shape[0]
