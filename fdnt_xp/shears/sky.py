@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from types import ModuleType
 
-from fdnt_xp.arrays import Array, device_of
+from fdnt_xp.arrays import Array
 from fdnt_xp.fourier.psf import Psf
 from fdnt_xp.shapes.sky import sky_frame
 
@@ -39,7 +39,9 @@ class SampleSky:
         scale = xp.where(regular, frame.scale, xp.zeros_like(frame.scale))
         largest = float(xp.max(scale)) if int(scale.shape[0]) else 0.0
         length = largest if largest > 0.0 else 1.0
-        unit = length * xp.eye(2, dtype=stamps.dtype, device=device_of(stamps))[None, :, :]
-        matrices = xp.where(regular[:, None, None], frame.jacobian, unit)
+        # Whoever has none is given that of another, which makes no tables of its own.
+        first = xp.argmax(xp.astype(regular, xp.int32))[None] if largest > 0.0 else None
+        other = frame.jacobian if first is None else xp.take(frame.jacobian, first, axis=0)
+        matrices = xp.where(regular[:, None, None], frame.jacobian, other)
         seen = psf.through(matrices, unit_length=length)
         return cls(psf=seen, unit_length=length, regular=regular)
