@@ -85,6 +85,14 @@ def main() -> None:
     metavar="FITS",
     help="Of the shape of IMAGE: the inverse variance of each pixel, 0 where it is missing.",
 )
+@click.option(
+    "--jacobian",
+    metavar="DUDX,DUDY,DVDX,DVDY",
+    help="Of the pixels: shapes are those on the sky (u, v), lengths in its unit.",
+)
+@click.option(
+    "--wcs", is_flag=True, help="The Jacobian by the header of IMAGE: u west, v north, arcsec."
+)
 @HOW
 @OVERWRITE
 def measure(
@@ -100,6 +108,8 @@ def measure(
     noise_image: str | None,
     mask: str | None,
     weight: str | None,
+    jacobian: str | None,
+    wcs: bool,
     overwrite: bool,
     **how: Any,
 ) -> None:
@@ -121,6 +131,8 @@ def measure(
         noise_image=noise_image,
         mask=mask,
         weight=weight,
+        jacobian=jacobian,
+        wcs=wcs,
     )
     settings = Settings(**how)
     inputs.refuse_as_output(output)

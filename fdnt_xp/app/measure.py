@@ -7,17 +7,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
+
 import fdnt_xp.peers  # noqa: F401  gives its methods their names
 from fdnt_xp.app.backends import Backend, load_backend
 from fdnt_xp.app.responses import measure_source_responses
 from fdnt_xp.app.runner import Noise, find_noise, measure_source
-from fdnt_xp.data.images import Pixels, read_image
+from fdnt_xp.data.images import Pixels, read_header, read_image
 from fdnt_xp.data.ivar import IvarSource
 from fdnt_xp.data.provenance import Value, provenance
 from fdnt_xp.data.stamps import StampSource, cube_stamps, grid_stamps, position_stamps
 from fdnt_xp.data.tables import read_positions
+from fdnt_xp.data.wcs import wcs_jacobians
 from fdnt_xp.errors import CatalogError, FdntValueError
-from fdnt_xp.shapes.methods import method_in_noise, shape_method
+from fdnt_xp.shapes.methods import SHAPES_ON_SKY, method_in_noise, shape_method
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -46,6 +50,10 @@ class Inputs:
     mask, weight : str or None
         FITS files of the shape of the image: not 0 where a pixel is missing, and the inverse
         variance of each pixel.
+    jacobian : str or None
+        `dudx,dudy,dvdx,dvdy` of all pixels.
+    wcs : bool
+        Whether to take it from the header of the image, at each position.
     """
 
     image: str
@@ -59,6 +67,8 @@ class Inputs:
     noise_image: str | None = None
     mask: str | None = None
     weight: str | None = None
+    jacobian: str | None = None
+    wcs: bool = False
 
     @property
     def layout(self) -> str:
@@ -146,6 +156,25 @@ def open_source(inputs: Inputs) -> StampSource:
     return cube_stamps(pixels)
 
 
+def find_jacobians(inputs: Inputs, source: StampSource) -> NDArray[np.float64] | None:
+    """Return the Jacobian of all pixels, (2, 2), or at each galaxy, (n_gal, 2, 2), if wanted."""
+    if inputs.wcs:
+        if inputs.jacobian is not None or inputs.layout == "cube":
+            raise FdntValueError("--wcs wants positions on an image, and no --jacobian")
+        return wcs_jacobians(read_header(inputs.image), source.positions)
+    if inputs.jacobian is None:
+        return None
+    try:
+        numbers = [float(part) for part in inputs.jacobian.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 4:
+        raise FdntValueError(
+            f"--jacobian must be four numbers, dudx,dudy,dvdx,dvdy, not {inputs.jacobian!r}"
+        )
+    return np.reshape(numbers, (2, 2))
+
+
 def measure_files(inputs: Inputs, settings: Settings) -> tuple[Table, float]:
     """Measure an image; return the catalog with its provenance, and the seconds it took."""
     backend = load_backend(settings.backend, settings.device, settings.dtype)
@@ -168,6 +197,11 @@ def measure_files(inputs: Inputs, settings: Settings) -> tuple[Table, float]:
     coloured = None
     if noise.power is not None and ivar is None:
         coloured = method_in_noise(settings.method, backend.from_numpy(noise.power))
+    jacobians = find_jacobians(inputs, source)
+    if jacobians is not None and settings.method not in SHAPES_ON_SKY:
+        raise FdntValueError(
+            f"--jacobian and --wcs are for --method {', '.join(SHAPES_ON_SKY)} and --responses"
+        )
     start = time.perf_counter()
     if settings.responses:
         table = measure_source_responses(
@@ -180,6 +214,7 @@ def measure_files(inputs: Inputs, settings: Settings) -> tuple[Table, float]:
             seed=settings.seed,
             chunk=settings.chunk,
             quiet=settings.quiet,
+            jacobians=jacobians,
         )
     else:
         table = measure_source(
@@ -193,6 +228,7 @@ def measure_files(inputs: Inputs, settings: Settings) -> tuple[Table, float]:
             size=settings.size,
             chunk=settings.chunk,
             quiet=settings.quiet,
+            jacobians=jacobians,
         )
     seconds = time.perf_counter() - start
     table.meta = _facts(
@@ -211,6 +247,13 @@ def _open_beside(source: StampSource, path: str | None, what: str) -> StampSourc
     if path is None:
         return None
     return source.beside(read_image(path, ndim=(2, 3), what=what), what)
+
+
+def _short(jacobian: str | None) -> str | None:
+    """Return the numbers of a Jacobian with as many digits as a card of a header holds."""
+    if jacobian is None:
+        return None
+    return ",".join(f"{float(part):.6g}" for part in jacobian.split(","))
 
 
 def _facts(
@@ -246,6 +289,7 @@ def _facts(
         maskimg=inputs.mask,
         ivarimg=inputs.weight,
         noisecor=correlated,
+        jacobian="wcs" if inputs.wcs else _short(inputs.jacobian),
         bordlvl=noise.border.level if noise.border else None,
         wtsize=settings.size,
         chunk=settings.chunk,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdnt_xp.app.backends import Backend
-from fdnt_xp.app.runner import ChunkPsfs, Noise, measure_chunks
+from fdnt_xp.app.runner import ChunkPsfs, Noise, jacobian_of, measure_chunks
 from fdnt_xp.arrays import Array, array_namespace, device_of
 from fdnt_xp.data.images import Pixels
 from fdnt_xp.data.stamps import StampChunk, StampSource
@@ -34,12 +34,13 @@ def measure_source_responses(
     seed: int = 0,
     chunk: int | None = None,
     quiet: bool = True,
+    jacobians: NDArray[np.float64] | None = None,
 ) -> Table:
     """Measure the response of every galaxy of a source; memory is that of one chunk.
 
     Parameters
     ----------
-    source, psf_pixels, backend, oversampling, size, chunk, quiet
+    source, psf_pixels, backend, oversampling, size, chunk, quiet, jacobians
         As for `measure_source`; without `size`, one weight fits all galaxies.
     noise : Noise
         Of the pixels.
@@ -64,7 +65,7 @@ def measure_source_responses(
         )
     names = galaxy_numbers(source.ids)
     psfs = ChunkPsfs.of(psf_pixels, source, backend, oversampling)
-    size = size or _size_for_all(source, psfs, noise)
+    size = size or _size_for_all(source, psfs, noise, jacobians)
 
     def measure(part: StampChunk, stamps: Array, psf: Psf) -> Table:
         xp = array_namespace(stamps=stamps)
@@ -75,6 +76,7 @@ def measure_source_responses(
             seed=seed,
             identifiers=xp.asarray(names[part.rows], dtype=xp.int64, device=device_of(stamps)),
             size=size,
+            **_on_sky(jacobians, part.rows, backend),
         ).to_table()
 
     return measure_chunks(source, psfs, measure, chunk=chunk, quiet=quiet)
@@ -108,13 +110,21 @@ def _hash(name: Any) -> int:
     return int.from_bytes(digest, "big") >> 1
 
 
-def _size_for_all(source: StampSource, psfs: ChunkPsfs, noise: Noise) -> float | None:
+def _on_sky(
+    jacobians: NDArray[np.float64] | None, rows: slice, backend: Backend
+) -> dict[str, Array]:
+    return {} if jacobians is None else {"jacobian": jacobian_of(jacobians, rows, backend)}
+
+
+def _size_for_all(
+    source: StampSource, psfs: ChunkPsfs, noise: Noise, jacobians: NDArray[np.float64] | None
+) -> float | None:
     """Return the default size for all galaxies together, which no chunk of them knows."""
     if source.n_gal == 0:
         return None
     rows = rows_for_size(source.n_gal)
     stamps = psfs.backend.from_numpy(source.take(np.arange(source.n_gal)[rows]))
-    options = _as_options(noise, psfs.backend)
+    options = _as_options(noise, psfs.backend) | _on_sky(jacobians, rows, psfs.backend)
     return default_size(stamps, psfs.rows(rows), max_shear=STEP, **options)
 
 

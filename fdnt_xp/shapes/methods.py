@@ -35,6 +35,8 @@ _TRANSFORMS: Final[dict[str, Transform]] = {
     "fdnt-hybrid": "hybrid",
 }
 """Methods whose errors can be those of correlated noise."""
+SHAPES_ON_SKY: Final = tuple(_TRANSFORMS)
+"""Methods that take a `jacobian`, as `measure_shapes` does."""
 
 SHAPE_METHODS: dict[str, ShapeMethod] = {
     "fdnt-ft": measure_shapes,
