@@ -24,6 +24,7 @@ from fdnt_xp.data.simulate import great08_image
 from fdnt_xp.data.stamps import cube_stamps, grid_stamps
 from fdnt_xp.errors import CatalogError, FdntValueError, FdntWarning, ShapeMismatchError
 from fdnt_xp.flags import Flag
+from fdnt_xp.shapes.methods import method_in_noise, shape_method
 from fdnt_xp.shapes.results import PSF_COLUMNS
 from fdnt_xp.shears.responses import COLUMNS
 
@@ -240,6 +241,23 @@ def test_a_correlated_noise_image(folder, drawn):
     stamps, psf = source.read(0, N_GAL).stamps, fx.Psf.from_image(drawn.psf_image)
     whole = fx.measure_responses(stamps, psf, noise_power=noise.power)
     np.testing.assert_allclose(read_catalog("catalog.fits")["v1"], whole.v[:, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize("method", ["fdnt-ft", "fdnt-gl", "gauss-1"])
+def test_shapes_in_correlated_noise(method, folder, drawn):
+    shapes = ("measure", "image.fits", "--psf", "psf.fits", "--cell", CELL, "--method", method)
+    run(*shapes, "--noise-image", "correlated.fits", "-o", "catalog.fits")
+    header, table = fits.getheader("catalog.fits", 1), read_catalog("catalog.fits")
+    source = grid_stamps(drawn.image, CELL)
+    noise = find_noise(source, blank=fits.getdata("correlated.fits"))
+    stamps, psf = source.read(0, N_GAL).stamps, fx.Psf.from_image(drawn.psf_image)
+    if method == "gauss-1":  # knows white noise only
+        assert "NOISECOR" not in header
+        whole = shape_method(method)(stamps, psf, noise_variance=noise.variance)
+    else:
+        assert header["NOISECOR"] is True
+        whole = method_in_noise(method, noise.power)(stamps, psf)
+    np.testing.assert_allclose(table["eta1_var"], whole.eta_cov[:, 0, 0], rtol=1e-6)
 
 
 def test_a_cube_of_blank_stamps_and_plain_shapes(folder):

@@ -182,7 +182,7 @@ def plot_biases(biases: Sequence[NoiseBias]) -> Figure:
         axes["c"].set(ylabel="$c_1$")
         axes["sigma"].set(ylabel=r"$\sigma_g$ of a galaxy", ylim=(0.0, None))
         for panel in axes.values():
-            _snr_axis(panel, sorted({bias.snr for bias in biases}))
+            snr_axis(panel, sorted({bias.snr for bias in biases}))
         for panel in (axes["m"], axes["c"]):
             panel.axhline(0.0, color=PALE, lw=1.0, zorder=0)
         handles, labels = axes["sigma"].get_legend_handles_labels()
@@ -210,7 +210,7 @@ def _draw_estimator(axes: dict[str, Axes], biases: list[NoiseBias], shift: float
     axes["sigma"].plot(snr, sigma, marker, ms=5, color=colour, label=name)
 
 
-def _snr_axis(panel: Axes, snrs: list[float]) -> None:
+def snr_axis(panel: Axes, snrs: list[float]) -> None:
     """Label the axis of S/N at the values that were tested."""
     from matplotlib.ticker import NullLocator
 

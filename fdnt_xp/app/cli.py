@@ -18,6 +18,7 @@ from fdnt_xp.app.great08_commands import great08
 from fdnt_xp.app.measure import Inputs, Settings
 from fdnt_xp.app.measure_run import measure_files
 from fdnt_xp.app.plots import check_figure, plot_catalog, save_figure
+from fdnt_xp.app.psf_check import OWN, OwnOptions, refuse_without_psf, run_psf_check
 from fdnt_xp.app.ring import RingOptions, run_ring
 from fdnt_xp.app.shear import catalog_shear, report_lines
 from fdnt_xp.app.summary import summary_lines
@@ -88,6 +89,14 @@ def main() -> None:
     help="Of the shape of IMAGE: the inverse variance of each pixel, 0 where it is missing.",
 )
 @JOBS
+@click.option(
+    "--jacobian",
+    metavar="DUDX,DUDY,DVDX,DVDY",
+    help="Of the pixels: shapes are those on the sky (u, v), lengths in its unit.",
+)
+@click.option(
+    "--wcs", is_flag=True, help="The Jacobian by the header of IMAGE: u west, v north, arcsec."
+)
 @HOW
 @OVERWRITE
 def measure(
@@ -105,6 +114,8 @@ def measure(
     weight: str | None,
     jobs: int,
     scheduler: str | None,
+    jacobian: str | None,
+    wcs: bool,
     overwrite: bool,
     **how: Any,
 ) -> None:
@@ -129,6 +140,8 @@ def measure(
         noise_image=noise_image,
         mask=mask,
         weight=weight,
+        jacobian=jacobian,
+        wcs=wcs,
     )
     settings = Settings(**how)
     warn_of_too_many(jobs)
@@ -290,14 +303,21 @@ def ring(output: str | None, figure: str | None, overwrite: bool, **options: Any
     help="sqrt(<sum I^2>)/sigma.",
 )
 @click.option(
-    "--kind", type=click.Choice(KINDS), default="exp", show_default=True, help="Galaxies to draw."
+    "--kind", type=click.Choice(KINDS), help="Galaxies to draw. [default: exp; with --psf exp, dev]"
 )
 @click.option(
     "--radius",
     metavar="PIXELS",
     help="Half-light radius, or LOW,HIGH. [default: 2.3; for mixed 1.3,2.3]",
 )
-@click.option("--psf-e", type=float, default=0.1, show_default=True, help="e1 of it; e2 is half.")
+@click.option("--psf", metavar="FITS", help="Your PSF, in place of a Moffat.")
+@click.option("--oversampling", type=float, default=1.0, show_default=True, help="Of --psf.")
+@click.option("--pixel", is_flag=True, help="--psf lacks the response of the pixels.")
+@click.option("--noise-variance", type=float, help="With --psf: says the flux of each S/N.")
+@click.option("--noise-image", metavar="FITS", help="With --psf: blank sky, for its spectrum.")
+@click.option(
+    "--psf-e", type=float, default=0.1, show_default=True, help="e1 of the Moffat; e2 is half."
+)
 @click.option("--shear", type=float, default=0.02, show_default=True, help="Applied g, along x.")
 @click.option(
     "--estimator",
@@ -334,9 +354,26 @@ def check(output: str | None, figure: str | None, overwrite: bool, **options: An
 
     Prints the multiplicative and additive bias of each estimator of shear at each S/N, with
     errors, and the error of the shear from one galaxy. Fractions of a per cent want 100 000
-    stamps and more at low S/N.
+    stamps and more at low S/N. With --psf it says whether the population null, and the errors
+    of shears and shapes, are to be trusted with your PSF and noise.
     """
-    for line in run_check(CheckOptions(**options), output, figure, overwrite=overwrite):
+    own = {name: options.pop(name) for name in OWN}
+    kind = options.pop("kind")
+    if own["psf"] is None:
+        refuse_without_psf(own)
+        lines = run_check(
+            CheckOptions(kind=kind or "exp", **options), output, figure, overwrite=overwrite
+        )
+    else:
+        kinds = ("exp", "dev") if kind is None else (kind,)
+        lines = run_psf_check(
+            OwnOptions(kinds=kinds, **own),
+            CheckOptions(**options),
+            output,
+            figure,
+            overwrite=overwrite,
+        )
+    for line in lines:
         click.echo(line)
 
 

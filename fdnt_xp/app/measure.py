@@ -6,9 +6,13 @@ import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from fdnt_xp.data.images import image_file, read_image
+import numpy as np
+from numpy.typing import NDArray
+
+from fdnt_xp.data.images import image_file, read_header, read_image
 from fdnt_xp.data.stamps import StampSource, cube_stamps, grid_stamps, position_stamps
 from fdnt_xp.data.tables import read_positions
+from fdnt_xp.data.wcs import wcs_jacobians
 from fdnt_xp.errors import CatalogError, FdntValueError
 
 
@@ -35,6 +39,10 @@ class Inputs:
     mask, weight : str or None
         FITS files of the shape of the image: not 0 where a pixel is missing, and the inverse
         variance of each pixel.
+    jacobian : str or None
+        `dudx,dudy,dvdx,dvdy` of all pixels.
+    wcs : bool
+        Whether to take it from the header of the image, at each position.
     """
 
     image: str
@@ -48,6 +56,8 @@ class Inputs:
     noise_image: str | None = None
     mask: str | None = None
     weight: str | None = None
+    jacobian: str | None = None
+    wcs: bool = False
 
     @property
     def layout(self) -> str:
@@ -144,6 +154,25 @@ def open_source(inputs: Inputs) -> StampSource:
             "where its galaxies are, by --cell or by --positions and --stamp-size"
         )
     return cube_stamps(pixels)
+
+
+def find_jacobians(inputs: Inputs, source: StampSource) -> NDArray[np.float64] | None:
+    """Return the Jacobian of all pixels, (2, 2), or at each galaxy, (n_gal, 2, 2), if wanted."""
+    if inputs.wcs:
+        if inputs.jacobian is not None or inputs.layout == "cube":
+            raise FdntValueError("--wcs wants positions on an image, and no --jacobian")
+        return wcs_jacobians(read_header(inputs.image), source.positions)
+    if inputs.jacobian is None:
+        return None
+    try:
+        numbers = [float(part) for part in inputs.jacobian.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 4:
+        raise FdntValueError(
+            f"--jacobian must be four numbers, dudx,dudy,dvdx,dvdy, not {inputs.jacobian!r}"
+        )
+    return np.reshape(numbers, (2, 2))
 
 
 def open_beside(source: StampSource, path: str | None, what: str) -> StampSource | None:

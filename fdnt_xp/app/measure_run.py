@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import fdnt_xp.peers  # noqa: F401  gives its methods their names
 from fdnt_xp.app.backends import Backend, load_backend
 from fdnt_xp.app.chunks import ChunkSize
-from fdnt_xp.app.measure import Inputs, Settings, open_beside, open_source
+from fdnt_xp.app.measure import Inputs, Settings, find_jacobians, open_beside, open_source
 from fdnt_xp.app.noise import Noise, find_noise
 from fdnt_xp.app.parts import PartsReport, PartsRun, Rows
 from fdnt_xp.app.responses import common_size, response_measurer
@@ -24,7 +24,7 @@ from fdnt_xp.data.provenance import Value, provenance
 from fdnt_xp.data.row_batches import check_text
 from fdnt_xp.data.stamps import StampSource
 from fdnt_xp.errors import FdntValueError
-from fdnt_xp.shapes.methods import shape_method
+from fdnt_xp.shapes.methods import NULL_TEST_METHODS, method_in_noise, shape_method
 from fdnt_xp.shears.responses import COLUMNS as RESPONSE_COLUMNS
 
 if TYPE_CHECKING:
@@ -172,6 +172,11 @@ def _check(inputs: Inputs, settings: Settings) -> None:
         raise FdntValueError("--method chooses how shapes are measured, not --responses")
     if settings.responses and (inputs.mask or inputs.weight):
         raise FdntValueError("--mask and --weight are for shapes, not for --responses")
+    on_sky = inputs.wcs or inputs.jacobian is not None
+    if on_sky and settings.method not in NULL_TEST_METHODS:
+        raise FdntValueError(
+            f"--jacobian and --wcs are for --method {', '.join(NULL_TEST_METHODS)} and --responses"
+        )
 
 
 def _make_plan(inputs: Inputs, settings: Settings) -> tuple[Plan, Work]:
@@ -186,7 +191,7 @@ def _make_plan(inputs: Inputs, settings: Settings) -> tuple[Plan, Work]:
     noise = find_noise(source, settings.noise_variance, blank, mask=mask, mapped=mapped)
     size = settings.size
     if settings.responses:
-        size = size or common_size(source, psfs, noise)
+        size = size or common_size(source, psfs, noise, find_jacobians(inputs, source))
     plan = Plan(
         inputs=inputs.absolute(),
         settings=settings,
@@ -206,9 +211,15 @@ def _open(inputs: Inputs, settings: Settings) -> tuple[StampSource, ChunkPsfs]:
 
 def _prepare(plan: Plan, source: StampSource, psfs: ChunkPsfs) -> Work:
     inputs, settings, noise = plan.inputs, plan.settings, plan.noise
+    jacobians = find_jacobians(inputs, source)
     if settings.responses:
         measure = response_measurer(
-            source, backend=psfs.backend, noise=noise, size=plan.size, seed=settings.seed
+            source,
+            backend=psfs.backend,
+            noise=noise,
+            size=plan.size,
+            seed=settings.seed,
+            jacobians=jacobians,
         )
     else:
         mask = open_beside(source, inputs.mask, "mask")
@@ -216,15 +227,27 @@ def _prepare(plan: Plan, source: StampSource, psfs: ChunkPsfs) -> Work:
         ivar = None
         if mask is not None or weight is not None:
             ivar = IvarSource(mask=mask, weight=weight, variance=noise.variance)
+        coloured = None
+        if noise.power is not None and ivar is None:
+            coloured = method_in_noise(settings.method, psfs.backend.from_numpy(noise.power))
         measure = shape_measurer(
-            shape_method(settings.method),
+            coloured or shape_method(settings.method),
             backend=psfs.backend,
-            noise_variance=noise.variance,
+            noise_variance=None if coloured else noise.variance,
             ivar=ivar,
             size=plan.size,
+            jacobians=jacobians,
         )
     size = ChunkSize(settings.chunk, psfs.backend)
     return Work(source=source, psfs=psfs, measure=measure, size=size)
+
+
+def _correlated(inputs: Inputs, settings: Settings, noise: Noise) -> bool | None:
+    """Return whether noise was taken for correlated; None for shapes where it was not."""
+    if settings.responses:
+        return noise.power is not None
+    known = settings.method in NULL_TEST_METHODS and not (inputs.mask or inputs.weight)
+    return (noise.power is not None and known) or None
 
 
 def _options(inputs: Inputs, settings: Settings) -> dict[str, Any]:
@@ -261,10 +284,18 @@ def _facts(
         noiseimg=inputs.noise_image,
         maskimg=inputs.mask,
         ivarimg=inputs.weight,
-        noisecor=noise.power is not None if settings.responses else None,
+        noisecor=_correlated(inputs, settings, noise),
+        jacobian="wcs" if inputs.wcs else _short(inputs.jacobian),
         bordlvl=noise.border.level if noise.border else None,
         wtsize=settings.size,
         chunk=settings.chunk,
         seed=settings.seed if settings.responses else None,
         rstep=step,
     )
+
+
+def _short(jacobian: str | None) -> str | None:
+    """Return the numbers of a Jacobian with as many digits as a card of a header holds."""
+    if jacobian is None:
+        return None
+    return ",".join(f"{float(part):.6g}" for part in jacobian.split(","))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fdnt_xp.app.backends import Backend
 from fdnt_xp.app.noise import Noise
-from fdnt_xp.app.runner import ChunkPsfs, MeasureChunk, measure_chunks
+from fdnt_xp.app.runner import ChunkPsfs, MeasureChunk, jacobian_of, measure_chunks
 from fdnt_xp.arrays import Array, array_namespace, device_of
 from fdnt_xp.data.images import Pixels
 from fdnt_xp.data.stamps import StampChunk, StampSource
@@ -35,12 +35,13 @@ def measure_source_responses(
     seed: int = 0,
     chunk: int | None = None,
     quiet: bool = True,
+    jacobians: NDArray[np.float64] | None = None,
 ) -> Table:
     """Measure the response of every galaxy of a source; memory is that of one chunk.
 
     Parameters
     ----------
-    source, psf_pixels, backend, oversampling, size, chunk, quiet
+    source, psf_pixels, backend, oversampling, size, chunk, quiet, jacobians
         As for `measure_source`; without `size`, one weight fits all galaxies.
     noise : Noise
         Of the pixels.
@@ -60,19 +61,27 @@ def measure_source_responses(
         With JAX in float32.
     """
     psfs = ChunkPsfs.of(psf_pixels, source, backend, oversampling)
-    size = size or common_size(source, psfs, noise)
-    measure = response_measurer(source, backend=backend, noise=noise, size=size, seed=seed)
+    size = size or common_size(source, psfs, noise, jacobians)
+    measure = response_measurer(
+        source, backend=backend, noise=noise, size=size, seed=seed, jacobians=jacobians
+    )
     return measure_chunks(source, psfs, measure, chunk=chunk, quiet=quiet)
 
 
 def response_measurer(
-    source: StampSource, *, backend: Backend, noise: Noise, size: float | None, seed: int
+    source: StampSource,
+    *,
+    backend: Backend,
+    noise: Noise,
+    size: float | None,
+    seed: int,
+    jacobians: NDArray[np.float64] | None = None,
 ) -> MeasureChunk:
     """Return what measures the responses of a chunk of a source.
 
     Parameters
     ----------
-    source, backend, noise, seed
+    source, backend, noise, seed, jacobians
         As for `measure_source_responses`.
     size : float or None
         Of the weight: the same for all galaxies; None only if there are none.
@@ -97,6 +106,7 @@ def response_measurer(
             seed=seed,
             identifiers=xp.asarray(names[part.rows], dtype=xp.int64, device=device_of(stamps)),
             size=size,
+            **_on_sky(jacobians, part.rows, backend),
         ).to_table()
 
     return measure
@@ -130,13 +140,21 @@ def _hash(name: Any) -> int:
     return int.from_bytes(digest, "big") >> 1
 
 
-def common_size(source: StampSource, psfs: ChunkPsfs, noise: Noise) -> float | None:
+def _on_sky(
+    jacobians: NDArray[np.float64] | None, rows: slice, backend: Backend
+) -> dict[str, Array]:
+    return {} if jacobians is None else {"jacobian": jacobian_of(jacobians, rows, backend)}
+
+
+def common_size(
+    source: StampSource, psfs: ChunkPsfs, noise: Noise, jacobians: NDArray[np.float64] | None
+) -> float | None:
     """Return the default size for all galaxies together, which no chunk of them knows."""
     if source.n_gal == 0:
         return None
     rows = rows_for_size(source.n_gal)
     stamps = psfs.backend.from_numpy(source.take(np.arange(source.n_gal)[rows]))
-    options = _as_options(noise, psfs.backend)
+    options = _as_options(noise, psfs.backend) | _on_sky(jacobians, rows, psfs.backend)
     return default_size(stamps, psfs.rows(rows), max_shear=STEP, **options)
 
 

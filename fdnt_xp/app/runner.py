@@ -53,6 +53,7 @@ def measure_source(
     size: float | None = None,
     chunk: int | None = None,
     quiet: bool = True,
+    jacobians: NDArray[np.float64] | None = None,
 ) -> Table:
     """Measure every galaxy of a source; memory is that of one chunk and the table.
 
@@ -78,6 +79,8 @@ def measure_source(
         Galaxies at a time.
     quiet : bool
         No progress bar; there is none either where stderr is not a terminal.
+    jacobians : array, shape (2, 2) or (n_gal, 2, 2), optional
+        Of the pixels, for methods that take them.
 
     Returns
     -------
@@ -91,7 +94,12 @@ def measure_source(
     """
     psfs = ChunkPsfs.of(psf_pixels, source, backend, oversampling)
     measure = shape_measurer(
-        method, backend=backend, noise_variance=noise_variance, ivar=ivar, size=size
+        method,
+        backend=backend,
+        noise_variance=noise_variance,
+        ivar=ivar,
+        size=size,
+        jacobians=jacobians,
     )
     return measure_chunks(source, psfs, measure, chunk=chunk, quiet=quiet)
 
@@ -103,16 +111,26 @@ def shape_measurer(
     noise_variance: float | None,
     ivar: IvarSource | None,
     size: float | None,
+    jacobians: NDArray[np.float64] | None = None,
 ) -> MeasureChunk:
     """Return what measures the shapes of a chunk; the parameters are those of `measure_source`."""
 
     def measure(part: StampChunk, stamps: Array, psf: Psf) -> Table:
+        options: dict[str, Any] = {"size": size}
         if ivar is None:
-            return method(stamps, psf, noise_variance=noise_variance, size=size).to_table()
-        weighted = backend.from_numpy(ivar.read(part))
-        return method(stamps, psf, ivar=weighted, size=size).to_table()
+            options["noise_variance"] = noise_variance
+        else:
+            options["ivar"] = backend.from_numpy(ivar.read(part))
+        if jacobians is not None:
+            options["jacobian"] = jacobian_of(jacobians, part.rows, backend)
+        return method(stamps, psf, **options).to_table()
 
     return measure
+
+
+def jacobian_of(jacobians: NDArray[np.float64], rows: slice, backend: Backend) -> Array:
+    """Return the Jacobian of all galaxies, or those of some, where the backend computes."""
+    return backend.from_numpy(jacobians if jacobians.ndim == 2 else jacobians[rows])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -94,6 +94,18 @@ def fits_errors(file: Path, what: str) -> Iterator[None]:
         raise CatalogError(f"cannot read the {what} {file}: {reason}")
 
 
+def read_header(path: str | os.PathLike[str], *, what: str = "image") -> fits.Header:
+    """Return the header of the image that `read_image` takes of a file, which says what it raises.
+
+    What an image in an extension inherits from the first header is not looked at.
+    """
+    file, extension = _split(path)
+    read_image(path, ndim=(2, 3), what=what)  # for its messages
+    with fits.open(file, memmap=True) as hdus:
+        chosen = [hdus[extension]] if extension is not None else hdus
+        return next(hdu.header.copy() for hdu in chosen if hdu.is_image and hdu.shape)
+
+
 def native_pixels(pixels: Pixels) -> NDArray[Any]:
     """Return a contiguous floating-point copy in memory, in the machine's byte order.
 

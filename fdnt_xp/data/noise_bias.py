@@ -32,6 +32,8 @@ from fdnt_xp.shears.responses import measure_responses
 SYMMETRIES: Final = (0, 1, 4, 5)
 """The versions of a galaxy that share noise, as `noise_symmetry` counts: as it is, turned
 with its noise, with the noise of opposite sign, and both."""
+_UNTURNED: Final = (0, 0, 4, 4)
+"""The same where the noise has directions of its own: it is not turned along."""
 VERSIONS: Final = 2 * len(SYMMETRIES)
 """Noisy stamps of a galaxy in one realisation of the noise: those, for either shear."""
 
@@ -131,6 +133,7 @@ def noise_bias(
     bound: float = 0.0,
     padding: int = 1,
     control: bool = True,
+    power: NDArray[np.float64] | None = None,
     seed: int = 0,
     to_array: Callable[[NDArray[np.float64]], Array] = np.asarray,
     quiet: bool = True,
@@ -160,6 +163,9 @@ def noise_bias(
     control : bool
         Whether to take off what is known of the noise and has no mean, for estimators that
         have such a control, without cuts. It changes the errors alone.
+    power : array, shape (ny, nx), optional
+        Power spectrum of the noise, up to a factor, where it is correlated between pixels; as
+        `population_null` takes it. Errors of m are then larger, without a control.
     seed : int
         Of the noise.
     to_array : callable
@@ -202,7 +208,9 @@ def noise_bias(
         padding=padding,
     )
     n_batches = max(2, math.ceil(n_stamps / (VERSIONS * batch)))
-    control = control and cut is None and observed_cut is None
+    if power is not None:
+        power = sigma**2 * power / np.mean(power)
+    control = control and cut is None and observed_cut is None and power is None
     tallies = {
         name: _Tally(name=name, control=ESTIMATORS[name].control if control else None, pairs=[])
         for name in estimators
@@ -213,7 +221,7 @@ def noise_bias(
     ) as bar:
         for number in range(n_batches):
             seeds = [seed, versions.population.seed, number, round(1000 * snr)]
-            pair = _noisy_pair(versions, number, batch, sigma, seeds)
+            pair = _noisy_pair(versions, number, batch, sigma, seeds, power)
             if observed_cut is not None:
                 pair = _cut_as_seen(pair, settings, observed_cut)
             for tally in tallies.values():
@@ -238,16 +246,29 @@ def _one_or_all(images: NDArray[np.float64]) -> NDArray[np.float64]:
     return images[0] if len(images) == 1 else images
 
 
+def coloured(white: NDArray[np.float64], power: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return noise of a power spectrum, made of stamps of white noise of variance 1."""
+    # The same at k and -k, so that what comes back is real.
+    return np.fft.ifft2(np.fft.fft2(white) * np.sqrt(power)).real
+
+
 def _noisy_pair(
-    versions: Versions, number: int, batch: int, sigma: float, seed: list[int]
+    versions: Versions,
+    number: int,
+    batch: int,
+    sigma: float,
+    seed: list[int],
+    power: NDArray[np.float64] | None,
 ) -> tuple[NoisyStamps, NoisyStamps]:
     """Return the stamps of a batch with shear +g, and those with -g."""
     rng = np.random.default_rng(seed)
     names = number * batch + np.arange(batch)
     rows = names % versions.population.n_gal
     size = versions.population.stamp_size
-    noise = sigma * rng.standard_normal((batch, size, size))
-    turned = turn_quarter(noise)
+    white = rng.standard_normal((batch, size, size))
+    noise = sigma * white if power is None else coloured(white, power)
+    turned = turn_quarter(noise) if power is None else noise
+    symmetries = SYMMETRIES if power is None else _UNTURNED
     added = int(rng.integers(2**31))
 
     def stamps(minus: int) -> NoisyStamps:
@@ -257,13 +278,14 @@ def _noisy_pair(
             pixels=clean + np.concatenate([noise, turned, -noise, -turned]),
             clean=clean,
             shear=-shear if minus else shear,
-            identifiers=np.tile(names, len(SYMMETRIES)),
-            symmetry=np.repeat(SYMMETRIES, batch),
-            psf_of=np.tile(versions.psf_of[rows], len(SYMMETRIES)),
+            identifiers=np.tile(names, len(symmetries)),
+            symmetry=np.repeat(symmetries, batch),
+            psf_of=np.tile(versions.psf_of[rows], len(symmetries)),
             offsets=np.concatenate([versions.offsets[rows, turn] for turn in (0, 1, 0, 1)]),
             variance=sigma**2,
             seed=added,
             e_rms=versions.e_rms,
+            power=power,
         )
 
     return stamps(0), stamps(1)

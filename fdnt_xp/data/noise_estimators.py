@@ -94,6 +94,13 @@ def arrays_of(stamps: NoisyStamps, settings: Settings) -> tuple[Array, Psf, dict
     return pixels, psf, {name: xp.asarray(n, device=device) for name, n in numbers.items()}
 
 
+def noise_of(stamps: NoisyStamps, settings: Settings) -> dict[str, Any]:
+    """Return what our estimators are told of the noise: its variance, or its power."""
+    if stamps.power is None:
+        return {"noise_variance": stamps.variance}
+    return {"noise_power": settings.to_array(stamps.power)}
+
+
 def _found(estimate: ShearEstimate) -> Found:
     g, error = (np.asarray(to_numpy(a), dtype=np.float64) for a in (estimate.g, estimate.g_err))
     sigma_g = float(np.sqrt(np.mean(error**2) * estimate.n_used))
@@ -106,7 +113,7 @@ def _null(stamps: NoisyStamps, settings: Settings, **options: Any) -> Found:
         population_null(
             pixels,
             psf,
-            noise_variance=stamps.variance,
+            **noise_of(stamps, settings),
             seed=stamps.seed,
             cut=settings.cut,
             padding=settings.padding,
@@ -130,7 +137,7 @@ def _responses(stamps: NoisyStamps, settings: Settings) -> Found:
     responses = measure_responses(
         pixels,
         psf,
-        noise_variance=stamps.variance,
+        **noise_of(stamps, settings),
         seed=stamps.seed,
         softening=settings.softening,
         bound=settings.bound,
@@ -142,7 +149,7 @@ def _responses(stamps: NoisyStamps, settings: Settings) -> Found:
 
 def _shapes(stamps: NoisyStamps, settings: Settings) -> Found:
     pixels, psf, _ = arrays_of(stamps, settings)
-    shapes = measure_shapes(pixels, psf, noise_variance=stamps.variance, padding=settings.padding)
+    shapes = measure_shapes(pixels, psf, **noise_of(stamps, settings), padding=settings.padding)
     return _found(shear_from_shapes(shapes))
 
 

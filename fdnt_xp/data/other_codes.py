@@ -49,6 +49,8 @@ class NoisyStamps:
         Of whatever noise the estimator adds.
     e_rms : float
         Of one component of the distortions before the shear.
+    power : array, shape (ny, nx), optional
+        Power spectrum of the noise, where pixels are not independent.
     """
 
     pixels: NDArray[np.float64]
@@ -61,6 +63,7 @@ class NoisyStamps:
     variance: float
     seed: int
     e_rms: float
+    power: NDArray[np.float64] | None = None
 
     def take(self, rows: NDArray[np.int64]) -> NoisyStamps:
         """Return the stamps of the given rows."""

@@ -51,6 +51,7 @@ COMMENTS: Final[dict[str, str]] = {
     "IVARIMG": "map of the inverse variance of each pixel",
     "MASKIMG": "image of missing pixels",
     "NOISECOR": "whether noise was taken for correlated",
+    "JACOBIAN": "of the pixels",
     "BORDLVL": "median of the stamps' border pixels",
     "WTSIZE": "[pix] weight size, if it was fixed",
     "CHUNK": "galaxies measured at a time",

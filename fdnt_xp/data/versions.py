@@ -46,6 +46,8 @@ class Population:
         Pixels on a side.
     seed : int
         Of everything that is drawn but the noise.
+    psf_image : str, optional
+        Name of the image that is the PSF, where it is no Moffat; `psf_e` says nothing then.
     """
 
     kind: Kind = "exp"
@@ -55,6 +57,7 @@ class Population:
     n_gal: int = 1024
     stamp_size: int = 48
     seed: int = 0
+    psf_image: str | None = None
 
     def __post_init__(self) -> None:
         """Refuse what cannot be drawn."""
@@ -111,8 +114,15 @@ class Versions:
     e_rms: float
 
 
-def draw_versions(population: Population) -> Versions:
+def draw_versions(population: Population, psf: Any | None = None) -> Versions:
     """Draw every galaxy four times: as it is and turned, with shear +g and -g.
+
+    Parameters
+    ----------
+    population : Population
+    psf : galsim.GSObject, optional
+        In place of the Moffat; the pixel response included, centred on 0, lengths in pixels.
+        See `fdnt_xp.data.own_psf.psf_of_image`.
 
     Raises
     ------
@@ -124,8 +134,10 @@ def draw_versions(population: Population) -> Versions:
     accuracy = galsim.GSParams(folding_threshold=2e-3, maximum_fft_size=32768, kvalue_accuracy=1e-6)
     n, size = population.n_gal, population.stamp_size
     rng = np.random.default_rng([population.seed, 0])
-    psfs = [galsim.Moffat(beta=PSF_BETA, fwhm=fwhm, gsparams=accuracy).shear(e1=e1, e2=e2)
-            for fwhm, e1, e2 in _psf_shapes(population, rng)]  # fmt: skip
+    pixel = psf is None
+    psfs = [psf] if psf is not None else [
+        galsim.Moffat(beta=PSF_BETA, fwhm=fwhm, gsparams=accuracy).shear(e1=e1, e2=e2)
+        for fwhm, e1, e2 in _psf_shapes(population, rng)]  # fmt: skip
     psf_of = rng.integers(len(psfs), size=n)
     g, angle = _intrinsic_g(rng, n), rng.uniform(0.0, 2.0 * np.pi, n)
     shapes = np.stack([g * np.cos(angle), g * np.sin(angle)], axis=-1)
@@ -146,11 +158,11 @@ def draw_versions(population: Population) -> Versions:
             for minus, shear in enumerate((population.shear, -population.shear)):
                 seen = galsim.Convolve([galaxy.shear(g1=shear, g2=0.0), psfs[psf_of[i]]])
                 at = galsim.PositionD(*offsets[i, turned])
-                stamps[i, turned, minus] = _draw(seen, size, at)
+                stamps[i, turned, minus] = _draw(seen, size, at, pixel)
     return Versions(
         population=population,
         stamps=stamps,
-        psf_images=np.stack([_draw(psf, size, None) for psf in psfs]),
+        psf_images=np.stack([_draw(one, size, None, pixel) for one in psfs]),
         psf_of=psf_of,
         offsets=offsets,
         e_rms=float(np.sqrt(0.5 * np.mean((2.0 * g / (1.0 + g**2)) ** 2))),
@@ -174,6 +186,9 @@ def _intrinsic_g(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
     return g[:n]
 
 
-def _draw(profile: Any, size: int, offset: Any) -> NDArray[np.float64]:
-    image = profile.drawImage(nx=size, ny=size, scale=1.0, offset=offset, dtype=np.float64)
+def _draw(profile: Any, size: int, offset: Any, pixel: bool) -> NDArray[np.float64]:
+    method = "auto" if pixel else "no_pixel"
+    image = profile.drawImage(
+        nx=size, ny=size, scale=1.0, offset=offset, dtype=np.float64, method=method
+    )
     return np.asarray(image.array)

@@ -15,7 +15,7 @@ from types import ModuleType
 
 import numpy as np
 
-from fdnt_xp.arrays import Array, Device, DType, array_namespace
+from fdnt_xp.arrays import Array, Device, DType, Rows, array_namespace
 from fdnt_xp.shear import shear_matrix
 
 
@@ -87,6 +87,16 @@ class KGrid:
         source = xp.searchsorted(self.index, position)
         one = xp.ones_like(self.kx)
         return source, xp.where(other, -one, one)
+
+    @property
+    def radius(self) -> Array:
+        """Length of the coordinates of each mode, rad/pixel, shape (1, n_k)."""
+        xp = array_namespace(kx=self.kx)
+        return xp.sqrt(self.kx**2 + self.ky**2)[None, :]
+
+    def take(self, rows: Rows) -> KGrid:  # noqa: ARG002  a grid may know its galaxies
+        """Return the grid of the given galaxies: the same."""
+        return self
 
     @cached_property
     def squares(self) -> Array:

@@ -30,7 +30,10 @@ def unit_jacobian(jacobian: Array) -> Array:
 
 
 def wave_frame(unit: Array) -> Array:
-    """Return `A = B⁻ᵀ`, which takes k of the image to that of the sky; shape (n, 2, 2)."""
+    """Return `A = B⁻ᵀ`, which takes k of the image to that of the sky; shape (n, 2, 2).
+
+    B may have any determinant but 0.
+    """
     xp = array_namespace(unit=unit)
     a, b, c, d = (unit[:, i, j] for i in (0, 1) for j in (0, 1))
     rows = [xp.stack([d, -c], axis=-1), xp.stack([-b, a], axis=-1)]
@@ -38,10 +41,10 @@ def wave_frame(unit: Array) -> Array:
 
 
 def longest_stretch(unit: Array) -> Array:
-    """Return the largest singular value of B, shape (n,); the least is its inverse."""
+    """Return the largest singular value of B, shape (n,)."""
     xp = array_namespace(unit=unit)
     square = _square(unit)
-    excess = xp.maximum(square**2 - 4.0, xp.zeros_like(square))
+    excess = xp.maximum(square**2 - 4.0 * _determinant(unit) ** 2, xp.zeros_like(square))
     return xp.sqrt(0.5 * (square + xp.sqrt(excess)))
 
 

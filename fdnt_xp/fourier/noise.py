@@ -82,6 +82,25 @@ class PixelNoise:
             correlation = rows_of(correlation, rows)
         return PixelNoise(variance=rows_of(self.variance, rows), correlation=correlation)
 
+    def without_window(self) -> PixelNoise:
+        """Return the noise as it is on a plane without end.
+
+        A stamp of n pixels has `n - |lag|` pairs of pixels at a lag, along each axis: so
+        much less of a correlation is in its periodogram, and in the correlation function that
+        is made of it. Lags beyond half a stamp, of which there is no telling, are taken for
+        none.
+        """
+        if self.correlation is None:
+            return self
+        xp = array_namespace(correlation=self.correlation)
+        like = {"dtype": self.correlation.dtype, "device": device_of(self.correlation)}
+        along_y, along_x = (
+            1.0 - xp.abs(xp.arange(n, **like) - float(n // 2)) / n
+            for n in (int(size) for size in self.correlation.shape[1:])
+        )
+        pairs = along_y[:, None] * along_x[None, :]
+        return replace(self, correlation=self.correlation / pairs)
+
     @property
     def shared(self) -> bool:
         """Whether all galaxies have noise of one shape, whatever its variance."""
@@ -154,7 +173,7 @@ class DeconvolvedNoise:
         Parameters
         ----------
         grid : KGrid
-            `KGrid.sheared(gamma)` of the grid of the data.
+            `KGrid.sheared(gamma)` of the grid of the data, or the `SkyGrid` of the frame.
         gamma : tuple of float
             The trial shear, eta-type.
         reach : float
@@ -175,7 +194,7 @@ class DeconvolvedNoise:
         row = xp.arange(n_psf * _DIRECTIONS, dtype=xp.int64, device=device_of(self.kmax))
         values = xp.reshape(cubic_table(lines).evaluate(t, row)[0], (n_psf, _DIRECTIONS, CIRCLES))
         largest = cubic_table(xp.max(values, axis=1) + math.log1p(_MARGIN))
-        kappa = xp.sqrt(grid.kx**2 + grid.ky**2)[None, :] * (reach / self.kmax)[:, None]
+        kappa = grid.radius * (reach / self.kmax)[:, None]
         return xp.exp(largest.evaluate(kappa, None if n_psf == 1 else row[:n_psf])[0])
 
 
@@ -236,7 +255,8 @@ def _ln_polar(psf: Psf, pixels: PixelNoise) -> Array:
     for first in range(0, psf.n_psf, _PSFS_AT_ONCE):
         rows = slice(first, min(first + _PSFS_AT_ONCE, psf.n_psf))
         correlation = pixels.take(rows).correlation
-        parts.append(power_on_circles(correlation, radii[rows, :], CIRCLE_POINTS, 1.0))
+        unit = None if psf.unit_jacobian is None else psf.unit_jacobian[rows, :, :]
+        parts.append(power_on_circles(correlation, radii[rows, :], CIRCLE_POINTS, 1.0, unit))
     power = xp.sqrt(xp.concat(parts))
     # A mode without noise, as k = 0 of an image less its mean, has no logarithm.
     return xp.log(xp.maximum(power, xp.full_like(power, _LEAST_POWER))) - psf.ln_power

@@ -64,7 +64,8 @@ class Psf:
         Which PSF each galaxy has, where several share one.
     unit_jacobian : array, shape (n_psf, 2, 2), optional
         B of the galaxies' pixels (`fdnt_xp.fourier.jacobian`). With it `kmax`, `weight` and
-        `ln_power` are about wave numbers on the sky, in units of pixels as large as theirs.
+        `ln_power` are about wave numbers on the sky, in units of pixels as large as theirs, or
+        of another length that all have in common (`through`).
     """
 
     image: Array
@@ -193,7 +194,7 @@ class Psf:
         xp = array_namespace(image=self.image)
         return replace(self, index=_checked_index(xp, self.image, psf_index))
 
-    def through(self, jacobian: Array) -> Psf:
+    def through(self, jacobian: Array, unit_length: float | None = None) -> Psf:
         """Return the PSFs with weights that are round on the sky.
 
         The tables are made once for each different pair of a PSF and a unit Jacobian, with
@@ -204,9 +205,12 @@ class Psf:
         ----------
         jacobian : array, shape (1, 2, 2) or (n_gal, 2, 2)
             Of the galaxies' pixels; regular.
+        unit_length : float, optional
+            On the sky: wave numbers there are in rad over this length. That of each galaxy's
+            own pixels by default.
         """
         xp = array_namespace(image=self.image, jacobian=jacobian)
-        unit = unit_jacobian(jacobian)
+        unit = unit_jacobian(jacobian) if unit_length is None else jacobian / unit_length
         seen, index = self, self.index
         numbers = xp.arange(self.n_psf, dtype=xp.int64, device=device_of(unit))
         if int(unit.shape[0]) == 1:
@@ -216,7 +220,8 @@ class Psf:
             unit = xp.take(unit, rows, axis=0)
             numbers = xp.zeros_like(rows) if self.n_gal is None else self.numbers_of(rows)
             seen = replace(self, index=None).take(numbers)
-        rounded = unit_jacobian(xp.round(unit * _UNIT_STEPS) / _UNIT_STEPS)
+        rounded = xp.round(unit * _UNIT_STEPS) / _UNIT_STEPS
+        rounded = unit_jacobian(rounded) if unit_length is None else rounded
         rows, table = _different(numbers, rounded)
         kmax, weight, ln_power = circle_tables(
             xp.take(seen.image, rows, axis=0),

@@ -15,6 +15,7 @@ from fdnt_xp.fourier.transform import DeconvolvedStamps
 from fdnt_xp.nulltests.dogleg import DoglegOptions, RootProblem, find_root
 from fdnt_xp.nulltests.scaled import over_scale
 from fdnt_xp.nulltests.weights import Weight
+from fdnt_xp.shear import shear_matrix
 
 _WIDE: Final = 0.125
 """Size of the weight of the first centroid, in sides of the stamp: it reaches a third of it."""
@@ -43,7 +44,9 @@ class DipoleTests:
         """Return the problem of the given galaxies."""
         shared = int(self.weight.shape[0]) == 1
         weight = self.weight if shared else rows_of(self.weight, rows)
-        return replace(self, galaxies=self.galaxies.take(rows), weight=weight)
+        return replace(
+            self, grid=self.grid.take(rows), galaxies=self.galaxies.take(rows), weight=weight
+        )
 
     def evaluate(self, x: Array) -> tuple[Array, Array]:
         """Return `sum W Im I~ k / (L sum W Re I~ |k|²)` and its Jacobian by x0/L.
@@ -68,9 +71,9 @@ class DipoleTests:
         evens, odds = [], []
         for rows in blocks_in_cache(self.galaxies.re):
             block = self.take(rows)
-            re, im = block.galaxies.shifted(self.grid, centroid[rows, :])
-            evens.append(self.grid.moments(block.weight * re, 2))
-            odds.append(self.grid.moments(block.weight * im, 1, 3))
+            re, im = block.galaxies.shifted(block.grid, centroid[rows, :])
+            evens.append(block.grid.moments(block.weight * re, 2))
+            odds.append(block.grid.moments(block.weight * im, 1, 3))
         even, odd = xp.concat(evens), xp.concat(odds)
         odd, cubic = odd[:, :2], odd[:, 2:]
         # d Im/dx0 = kx Re, and d(scale)/dx0 = -sum W Im k |k|².
@@ -121,12 +124,18 @@ def wide_weight(
         Shorter side of the stamps, pixels.
     applied_shear : array, shape (2,), optional
         Makes the weight round in the frame from which this eta is taken off: the null of
-        its dipole then follows that shear. By default it is round on the image.
+        its dipole then follows that shear. By default it is round on the image, or, where the
+        weight has a frame, on the sky.
     """
     xp = array_namespace(kmax=weight.kmax)
     shrink = xp.ones_like(weight.kmax)
     if applied_shear is not None:
-        grid = grid.sheared(applied_shear)
+        if weight.frame is None:
+            grid = grid.sheared(applied_shear)
+        else:
+            weight = replace(
+                weight, frame=xp.matmul(shear_matrix(applied_shear)[None, :, :], weight.frame)
+            )
         # As in the null tests: the weight may not reach out of the disc.
         shrink = shrink * xp.exp(0.5 * xp.sqrt(xp.sum(applied_shear**2)))
     return weight.round_window(grid, _WIDE * side, shrink)

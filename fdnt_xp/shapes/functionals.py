@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from fdnt_xp.arrays import Array, array_namespace, device_of
 from fdnt_xp.fourier.grid import KGrid
+from fdnt_xp.fourier.noise import PixelNoise
 from fdnt_xp.fourier.transform import complex_like, mode_phase
 from fdnt_xp.nulltests.forms import sheared_forms
 from fdnt_xp.nulltests.tests import NullTests, TestNoise
@@ -102,6 +103,31 @@ def on_pixels(h: Array, grid: KGrid, stamp_shape: tuple[int, int]) -> Array:
     plane = xp.concat([half, rest], axis=-1)
     image = xp.real(xp.fft.ifftn(plane, axes=(-2, -1))) * float(grid.shape[0] * grid.shape[1])
     return xp.reshape(image[:, :, :ny, :nx], (n_gal, n, ny * nx))
+
+
+def correlated_covariance(b: Array, noise: PixelNoise, stamp_shape: tuple[int, int]) -> Array:
+    """Return `sum B_j(x) C(x - x') B_k(x')`, shape (n_gal, n, n), for noise of unit variance.
+
+    Parameters
+    ----------
+    b : array, shape (n_gal, n, ny nx)
+        Functionals of the pixels.
+    noise : PixelNoise
+        With a correlation function C.
+    stamp_shape : tuple of int
+        (ny, nx).
+    """
+    xp = array_namespace(b=b)
+    n_gal, n, _ = b.shape
+    ny, nx = stamp_shape
+    padded = (2 * ny, 2 * nx)  # nothing comes in again on the other side
+    correlation = xp.fft.rfftn(noise.correlation, s=padded, axes=(-2, -1))[:, None, :, :]
+    spectrum = xp.fft.rfftn(xp.reshape(b, (n_gal, n, ny, nx)), s=padded, axes=(-2, -1))
+    smooth = xp.fft.irfftn(spectrum * correlation, s=padded, axes=(-2, -1))
+    # No lag is at the middle of C.
+    first_y, first_x = ny // 2, nx // 2
+    smooth = smooth[:, :, first_y : first_y + ny, first_x : first_x + nx]
+    return xp.matmul(b, xp.matrix_transpose(xp.reshape(smooth, b.shape)))
 
 
 def on_coefficients(h: Array, basis: LaguerreBasis, grid: KGrid) -> Array:

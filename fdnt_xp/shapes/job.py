@@ -90,7 +90,8 @@ class Job:
         An empty sample still has its one chunk, of no rows.
         """
         index = self.psf.index
-        if index is None or self.weight.shared or n_gal < _FEWEST_ON_A_PSF * self.psf.n_psf:
+        few = n_gal == 0 or n_gal < _FEWEST_ON_A_PSF * self.psf.n_psf
+        if index is None or self.weight.shared or few:
             firsts = range(0, max(n_gal, 1), n_chunk)
             return [Chunk(rows=slice(first, min(first + n_chunk, n_gal))) for first in firsts]
         xp = array_namespace(index=index)

@@ -59,6 +59,7 @@ def measure_shapes(
     *,
     noise_variance: float | Array | None = None,
     ivar: Array | None = None,
+    noise_power: Array | None = None,
     jacobian: Array | None = None,
     transform: Transform = "ft",
     order: int = 12,
@@ -80,11 +81,15 @@ def measure_shapes(
     psf : Psf
         One for all stamps, or one for each.
     noise_variance : float or array, shape (n_gal,), optional
-        Variance of the white noise of a pixel, (unit of the image)². Without it, and
-        without `ivar`, shapes have no covariance and no S/N.
+        Variance of the white noise of a pixel, (unit of the image)². Without it, `ivar` and
+        `noise_power`, shapes have no covariance and no S/N.
     ivar : array, shape (n_gal, ny, nx), optional
         In place of `noise_variance` the inverse variance of each pixel, 0 where it is
         missing: what such a pixel holds, be it NaN, is not looked at.
+    noise_power : array, shape (ny, nx) or (n_gal, ny, nx), optional
+        In place of both the power spectrum of noise that is correlated between pixels but
+        stationary, `E|FFT(noise)|²/(ny nx)` of stamps cut from it, in the order of the FFT:
+        `measure_noise_power(blank).power`. Its mean is the variance.
     jacobian : array, shape (2, 2) or (n_gal, 2, 2), optional
         `d(u, v)/d(x, y)`: what a step along the pixels is on the sky, in any unit, for all
         stamps or for each. Shapes, their errors and sizes are then those in (u, v), angles
@@ -127,8 +132,9 @@ def measure_shapes(
         `ivar` or `jacobian` another shape.
     FdntValueError, RangeError
         If a number is out of range, no stamp has as many pixels as the fit coefficients,
-        both `noise_variance` and `ivar` are given, there is no such transform, the one
-        Jacobian of all is singular, or the PSF is so wide that the stamps resolve nothing.
+        more than one of `noise_variance`, `ivar` and `noise_power` is given, `noise_power` is
+        no spectrum, there is no such transform, the one Jacobian of all is singular, or the
+        PSF is so wide that the stamps resolve nothing.
 
     References
     ----------
@@ -147,7 +153,7 @@ def measure_shapes(
     """
     xp, stamps = check_stamps(stamps, psf)
     n_gal = int(stamps.shape[0])
-    pixels = check_pixels(xp, stamps, noise_variance, ivar)
+    pixels = check_pixels(xp, stamps, noise_variance, ivar, noise_power)
     _check_transform(transform, order, stamps)
     check_options(size=size, padding=padding, chunk_size=chunk_size)
     check_count("max_iter", max_iter, 0)
@@ -205,7 +211,7 @@ def _measure_fits(job: Job, pixels: Pixels, flags: Array, order: int) -> ShapeRe
     xp = array_namespace(flags=flags)
     fit = fit_pixels_of(pixels, order)
     flags = xp.where(flags == 0, fit.flags, flags)
-    source = FittedStamps(fit=fit.harmless(), variance=pixels.variance)
+    source = FittedStamps(fit=fit.harmless(), pixels=pixels)
     # The functions reach out of the stamp, and a coarser grid would fold them back in.
     return _measure_on(job, job.fine, source, pixels.stamp_shape, flags)[0]
 

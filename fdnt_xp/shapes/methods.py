@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Protocol
+from typing import Final, Protocol
 
 from fdnt_xp.arrays import Array
 from fdnt_xp.errors import FdntValueError
 from fdnt_xp.fourier.psf import Psf
-from fdnt_xp.shapes.measure import measure_shapes
+from fdnt_xp.shapes.measure import Transform, measure_shapes
 from fdnt_xp.shapes.results import ShapeResult
 
 
@@ -29,12 +29,35 @@ class ShapeMethod(Protocol):
         """Measure the galaxy on each stamp."""
 
 
+_TRANSFORMS: Final[dict[str, Transform]] = {
+    "fdnt-ft": "ft",
+    "fdnt-gl": "gl",
+    "fdnt-hybrid": "hybrid",
+}
+"""What they are of `measure_shapes`."""
+NULL_TEST_METHODS: Final = tuple(_TRANSFORMS)
+"""Methods that take a `jacobian` and a `noise_power`, as `measure_shapes` does."""
+
 SHAPE_METHODS: dict[str, ShapeMethod] = {
     "fdnt-ft": measure_shapes,
     "fdnt-gl": partial(measure_shapes, transform="gl"),
     "fdnt-hybrid": partial(measure_shapes, transform="hybrid"),
 }
 """By name; `register_shape_method` adds to it."""
+
+
+def method_in_noise(name: str, power: Array) -> ShapeMethod | None:
+    """Return the method of a name for noise of a power spectrum; None if it knows white noise only.
+
+    Parameters
+    ----------
+    name : str
+    power : array, shape (ny, nx)
+        As `measure_shapes` takes it; no other noise may be given with the call.
+    """
+    if name not in _TRANSFORMS:
+        return None
+    return partial(measure_shapes, transform=_TRANSFORMS[name], noise_power=power)
 
 
 def register_shape_method(name: str, method: ShapeMethod) -> None:

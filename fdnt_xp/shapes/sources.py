@@ -1,6 +1,6 @@
 """Where the transform of a galaxy comes from, and what noise it brings along.
 
-Three sources of the same tests: whole stamps with white noise; stamps with an inverse
+Three sources of the same tests: whole stamps with stationary noise; stamps with an inverse
 variance for each pixel, some of them filled from a fit; and fits alone (FDNT-GL).
 """
 
@@ -14,7 +14,13 @@ from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.transform import DeconvolvedStamps, deconvolve
 from fdnt_xp.nulltests.tests import NullTests
 from fdnt_xp.shapes.fdnt_gl import deconvolve_fit
-from fdnt_xp.shapes.functionals import null_test_functionals, on_coefficients, on_image, on_pixels
+from fdnt_xp.shapes.functionals import (
+    correlated_covariance,
+    null_test_functionals,
+    on_coefficients,
+    on_image,
+    on_pixels,
+)
 from fdnt_xp.shapes.gl_fit import LaguerreFit, filled
 from fdnt_xp.shapes.laguerre import pixel_positions
 from fdnt_xp.shapes.pixels import Pixels
@@ -42,7 +48,7 @@ class Source(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class WhiteStamps:
-    """Stamps whose noise is white: independent from mode to mode."""
+    """Stamps with stationary noise, white or correlated: independent from mode to mode."""
 
     pixels: Pixels
 
@@ -65,6 +71,8 @@ class WhiteStamps:
         """Return one sum over k for each covariance."""
         xp = array_namespace(eta=eta)
         inverse_power = xp.real(inverse_transfer) ** 2 + xp.imag(inverse_transfer) ** 2
+        if self.pixels.correlated is not None:
+            inverse_power = inverse_power * self.pixels.correlated.relative_power(tests.grid)
         ny, nx = tests.grid.shape
         return white_noise(
             tests.noise(eta, centroid, inverse_power), self.pixels.variance * float(ny * nx)
@@ -135,22 +143,21 @@ class FittedStamps:
     ----------
     fit : LaguerreFit
         Finite.
-    variance : array, shape (n_gal,)
-        What `coefficients_cov` is to be multiplied with; NaN if unknown.
+    pixels : Pixels
+        What was fitted; `coefficients_cov` is for its `variance`.
     """
 
     fit: LaguerreFit
-    variance: Array
+    pixels: Pixels
 
     @property
     def n_gal(self) -> int:
         """Number of galaxies."""
-        return int(self.variance.shape[0])
+        return int(self.pixels.stamps.shape[0])
 
     def take(self, rows: Array) -> FittedStamps:
         """Return the given galaxies (integer array)."""
-        xp = array_namespace(rows=rows)
-        return FittedStamps(fit=self.fit.take(rows), variance=xp.take(self.variance, rows, axis=0))
+        return FittedStamps(fit=self.fit.take(rows), pixels=self.pixels.take(rows))
 
     def deconvolved(self, inverse_transfer: Array, grid: KGrid) -> DeconvolvedStamps:
         """Return the transforms of the galaxies before the PSF."""
@@ -159,16 +166,24 @@ class FittedStamps:
     def noise(
         self, tests: NullTests, eta: Array, centroid: Array, inverse_transfer: Array
     ) -> SolutionNoise:
-        """Return `beta Cov(b) betaᵀ`."""
+        """Return `beta Cov(b) betaᵀ`.
+
+        Where the noise is correlated, that of the pixels: b follows them by `Cov(b) phi`.
+        """
         xp = array_namespace(eta=eta)
         base = tests.noise(eta, centroid, xp.ones_like(tests.grid.kx)[None, :])
         h = null_test_functionals(tests, eta, base)
         h = on_image(h, centroid, inverse_transfer, tests.grid)
         beta = on_coefficients(h, self.fit.basis, tests.grid)
-        covariance = xp.matmul(
-            xp.matmul(beta, self.fit.coefficients_cov), xp.matrix_transpose(beta)
-        )
-        return SolutionNoise.of(base, covariance * self.variance[:, None, None])
+        followed = xp.matmul(beta, self.fit.coefficients_cov)
+        if self.pixels.correlated is None:
+            covariance = xp.matmul(followed, xp.matrix_transpose(beta))
+        else:
+            functions = self.fit.basis.in_x(*pixel_positions(xp, self.pixels.stamps))
+            covariance = correlated_covariance(
+                xp.matmul(followed, functions), self.pixels.correlated, self.pixels.stamp_shape
+            )
+        return SolutionNoise.of(base, covariance * self.pixels.variance[:, None, None])
 
 
 def filled_stamps(pixels: Pixels, fit: LaguerreFit) -> UnevenStamps:

@@ -11,11 +11,12 @@ stays where the PSF has left information.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Protocol
 
 from fdnt_xp.arrays import Array, array_namespace, device_of
 from fdnt_xp.fourier.grid import KGrid
+from fdnt_xp.fourier.sky_grid import SkyGrid
 from fdnt_xp.fourier.transform import DeconvolvedStamps
 from fdnt_xp.nulltests.dogleg import DoglegOptions, find_root
 from fdnt_xp.nulltests.tests import NullTests
@@ -336,14 +337,20 @@ class SolvedEta:
         """Return the statistic on a counter-sheared grid: see `Statistic`."""
         xp = array_namespace(start=start)
         column = start[:, 0]
+        # Through Jacobians it is the weight that knows the frame: centroids on the stamp then.
+        plain = grid.plain if isinstance(grid, SkyGrid) else grid
+        start = in_new_frame(start, grid, plain) if plain is not grid else start
         tests = NullTests(
-            grid=grid,
+            grid=plain,
             galaxies=galaxies,
             weight=weight,
             length=self.length,
             fixed_width=None if self.size is None else xp.full_like(column, self.size**2),
         )
         root = find_root(tests, start, options=_OPTIONS)
+        if plain is not grid:
+            root = replace(root, x=in_new_frame(root.x, plain, grid))
+            start = in_new_frame(start, plain, grid)
         found = root.success
         eta = _or_zero(root.x[:, :2], found)
         abs_eta = xp.sqrt(eta[:, 0] ** 2 + eta[:, 1] ** 2)

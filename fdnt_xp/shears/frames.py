@@ -16,9 +16,12 @@ from fdnt_xp.arrays import Array, Rows, array_namespace, device_of, has_any, row
 from fdnt_xp.flags import FAILED, Flag
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.noise import DeconvolvedNoise, PixelNoise, RoundNoise
+from fdnt_xp.fourier.sky_grid import SkyGrid
 from fdnt_xp.fourier.transform import DeconvolvedStamps, deconvolve
+from fdnt_xp.nulltests.weights import Weight
 from fdnt_xp.shapes.centroid import starting_centroid, wide_weight
 from fdnt_xp.shapes.job import Chunk, Job, in_order, screen
+from fdnt_xp.shear import shear_matrix
 from fdnt_xp.shears.counter_shear import FrameNoise, FrameValues, Statistic, in_new_frame
 from fdnt_xp.shears.cuts import QUANTITIES, FrameQuantities
 from fdnt_xp.shears.masks import SampleMask
@@ -74,9 +77,12 @@ class SampleValues(FrameValues):
     ----------
     flags : array, shape (n_gal,), int32
         What is to be said of the stamps; those with a bit of `FAILED` are not `found`.
+    centroid : array, shape (n_gal, 2)
+        On the stamp, pixels from its middle.
     """
 
     flags: Array
+    centroid: Array
 
 
 @dataclass(kw_only=True)
@@ -94,6 +100,10 @@ class FrameSample:
         Galaxies in memory together.
     noise : SampleNoise, optional
     mask : SampleMask, optional
+    regular : array, shape (1,) or (n_gal,), bool, optional
+        Where the Jacobian of a galaxy is one, if they have Jacobians.
+    unit_length : float
+        On the sky, of the lengths that the frames work in; quantities are in that of the sky.
     """
 
     stamps: Array
@@ -103,6 +113,8 @@ class FrameSample:
     chunk_size: int
     noise: SampleNoise | None = None
     mask: SampleMask | None = None
+    regular: Array | None = None
+    unit_length: float = 1.0
     _solutions: dict[int, tuple[Gamma, Array]] = field(default_factory=dict)
     """Of each chunk, by its number: the last frame and the unknowns that were solved there,
     the start of the next."""
@@ -124,6 +136,8 @@ class FrameSample:
             chunk_size=self.chunk_size,
             noise=None if self.noise is None else self.noise.take(rows),
             mask=None if self.mask is None else self.mask.take(rows),
+            regular=None if self.regular is None else _of_rows(self.regular, rows),
+            unit_length=self.unit_length,
         )
 
     def told_of_noise(self, factor: float) -> FrameSample:
@@ -147,21 +161,20 @@ class FrameSample:
         return self.job.chunks(self.n_gal, self.chunk_size)
 
     def _evaluate_chunk(self, number: int, gammas: Sequence[Gamma]) -> Iterator[SampleValues]:
-        xp = array_namespace(stamps=self.stamps)
         chunk = self._chunks[number]
         job = self.job.of(chunk)
         grid = job.coarse
-        like = {"dtype": self.stamps.dtype, "device": device_of(self.stamps)}
         noise = None if self.noise is None else self.noise.take(chunk.rows)
         stamps, flags = self._screened(chunk, job)
         optics = self._optics_of(chunk, job, noise)
         galaxies = deconvolve(stamps, optics.inverse_transfer, grid)
         synthetic = None if noise is None else noise.draw(grid)
-        frame, start = self._solutions.get(number) or ((0.0, 0.0), self._start(job, galaxies))
-        weight = job.weight.shrunk(self.reach)
+        known = self._solutions.get(number)
+        frame, start = (None, self._start(job, galaxies)) if known is None else known
         for gamma in gammas:
-            sheared = grid.sheared(xp.asarray(gamma, **like))
-            start = in_new_frame(start, grid.sheared(xp.asarray(frame, **like)), sheared)
+            sheared, weight = self._in_frame(job, gamma)
+            old = grid if frame is None else self._in_frame(job, frame)[0]
+            start = in_new_frame(start, old, sheared)
             seen, frame_noise = galaxies, None
             if noise is not None and optics.noise is not None:
                 power = optics.noise.power
@@ -171,8 +184,23 @@ class FrameSample:
                 frame_noise = FrameNoise(power=power, variance=noise.pixels.variance)
             values = self.statistic.evaluate(sheared, seen, weight, start, frame_noise)
             frame, start = gamma, values.solution
-            yield _withdrawn(values, flags)
-        self._solutions[number] = (frame, start)
+            centroid = job.length * sheared.on_stamp(values.solution[:, -2:])
+            yield _withdrawn(values, flags, centroid, self.unit_length)
+        if frame is not None:
+            self._solutions[number] = (frame, start)
+
+    def _in_frame(self, job: Job, gamma: Gamma) -> tuple[KGrid, Weight]:
+        """Return the grid, and the weight that is round there, in the frame of a trial shear.
+
+        Where the pixels have Jacobians the shear is one of the sky: `kappa = S_gamma A k`.
+        """
+        xp = array_namespace(stamps=self.stamps)
+        shear = xp.asarray(gamma, dtype=self.stamps.dtype, device=device_of(self.stamps))
+        weight = job.weight.shrunk(self.reach)
+        if weight.frame is None:
+            return job.coarse.sheared(shear), weight
+        matrix = xp.matmul(shear_matrix(shear)[None, :, :], weight.frame)
+        return SkyGrid.of(job.coarse, matrix), replace(weight, frame=matrix)
 
     def _screened(self, chunk: Chunk, job: Job) -> tuple[Array, Array]:
         """Return stamps that do no harm, their gaps filled, and what is to be said of them.
@@ -184,12 +212,16 @@ class FrameSample:
             Bits of `Flag`; with one of `FAILED` the galaxy cannot be measured.
         """
         stamps = rows_of(self.stamps, chunk.rows)
-        if self.mask is None:
-            return screen(stamps, job.psf)
         xp = array_namespace(stamps=stamps)
-        stamps, dropped, filled = self.mask.take(chunk.rows).applied(stamps, job.psf)
+        reasons = []
+        if self.mask is not None:
+            stamps, dropped, filled = self.mask.take(chunk.rows).applied(stamps, job.psf)
+            reasons = [(Flag.MASKED, dropped), (Flag.FILLED, filled)]
         stamps, flags = screen(stamps, job.psf)
-        for reason, holds in ((Flag.MASKED, dropped), (Flag.FILLED, filled)):
+        if self.regular is not None:
+            irregular = xp.broadcast_to(~_of_rows(self.regular, chunk.rows), flags.shape)
+            reasons.append((Flag.BAD_JACOBIAN, irregular))
+        for reason, holds in reasons:
             flags = flags + xp.astype(holds, xp.int32) * int(reason)
         return stamps, flags
 
@@ -230,7 +262,14 @@ class _Optics:
         return cls(inverse_transfer=inverse_transfer, noise=deconvolved)
 
 
-def _withdrawn(values: FrameValues, flags: Array) -> SampleValues:
+def _of_rows(column: Array, rows: Rows) -> Array:
+    """Return what the given galaxies have; one for all stays."""
+    return column if int(column.shape[0]) == 1 else rows_of(column, rows)
+
+
+def _withdrawn(
+    values: FrameValues, flags: Array, centroid: Array, unit_length: float
+) -> SampleValues:
     """Return the values with those of unusable galaxies withdrawn."""
     xp = array_namespace(flags=flags)
     usable = ~has_any(flags, int(FAILED))
@@ -242,6 +281,7 @@ def _withdrawn(values: FrameValues, flags: Array) -> SampleValues:
         return xp.where(usable[:, None], pair, xp.zeros_like(pair))
 
     quantities = {name: masked(getattr(values.quantities, name)) for name in QUANTITIES}
+    quantities["size"] = unit_length * quantities["size"]
     variance = values.v_variance
     return SampleValues(
         v=or_zero(values.v),
@@ -250,6 +290,7 @@ def _withdrawn(values: FrameValues, flags: Array) -> SampleValues:
         solution=values.solution,
         quantities=FrameQuantities(**quantities),
         flags=flags,
+        centroid=centroid,
     )
 
 
@@ -274,4 +315,5 @@ def _joined(parts: list[SampleValues], place: Array | None) -> SampleValues:
         solution=column("solution"),
         quantities=FrameQuantities(**quantities),
         flags=column("flags"),
+        centroid=column("centroid"),
     )

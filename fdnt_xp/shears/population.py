@@ -67,6 +67,7 @@ def population_null(
     softening: float = 1.0,
     bound: float = 0.0,
     max_shear: float | None = None,
+    jacobian: Array | None = None,
     padding: int = 1,
     chunk_size: int | None = None,
 ) -> ShearEstimate:
@@ -133,6 +134,9 @@ def population_null(
         Largest `|g|` in reach. The weight's disc is smaller than the PSF's by
         `sqrt((1 + max_shear)/(1 - max_shear))`, which costs resolution. By default 0.1, and
         0.3, the most that can be, where the shear turns out to be larger.
+    jacobian : array, shape (2, 2) or (n_gal, 2, 2), optional
+        `d(u, v)/d(x, y)` of the pixels, for all stamps or for each, as for `measure_shapes`: shear,
+        weight and noise made round are then those on the sky, `size` and sizes in its unit.
     padding, chunk_size : int
         As for `measure_shapes`.
 
@@ -194,6 +198,7 @@ def population_null(
             noise=noise,
             mask=mask,
             masked=masked,
+            jacobian=jacobian,
         )
         if sample.n_gal < 2:
             raise FdntValueError(f"stamps holds {sample.n_gal} galaxies; a null needs two")

@@ -28,6 +28,8 @@ FRAMES: Final = ("", "_1p", "_1m", "_2p", "_2m")
 """Suffixes of columns: as seen, and with shear of +h and -h put on along each component."""
 STEP: Final = 0.01
 """Reduced shear of the frames, unless the caller says otherwise."""
+_COMMON: Final = ("step", "on_sky")
+"""Fields that all galaxies have in common."""
 _LARGEST_STEP: Final = 0.1
 
 
@@ -53,6 +55,8 @@ class ResponseResult:
         Bits of `fdnt_xp.flags.Flag`.
     step : float
         The shear h of the frames, as a reduced shear.
+    on_sky : bool
+        Whether v, the responses and the sizes are those on the sky: by a Jacobian.
     """
 
     v: Array
@@ -63,6 +67,7 @@ class ResponseResult:
     centroid: Array
     flags: Array
     step: float
+    on_sky: bool = False
 
     @property
     def n_gal(self) -> int:
@@ -80,14 +85,16 @@ class ResponseResult:
         arrays = {
             f.name: xp.take(getattr(self, f.name), rows, axis=0)
             for f in fields(self)
-            if f.name != "step"
+            if f.name not in _COMMON
         }
-        return ResponseResult(step=self.step, **arrays)
+        return ResponseResult(step=self.step, on_sky=self.on_sky, **arrays)
 
     def to_numpy(self) -> ResponseResult:
         """Return the same result with NumPy arrays, copied to the host."""
-        arrays = {f.name: to_numpy(getattr(self, f.name)) for f in fields(self) if f.name != "step"}
-        return ResponseResult(step=self.step, **arrays)
+        arrays = {
+            f.name: to_numpy(getattr(self, f.name)) for f in fields(self) if f.name not in _COMMON
+        }
+        return ResponseResult(step=self.step, on_sky=self.on_sky, **arrays)
 
     def to_columns(self) -> dict[str, Array]:
         """Return the scalar columns of `COLUMNS`, each of shape (n_gal,)."""
@@ -110,6 +117,8 @@ class ResponseResult:
         table = Table(self.to_numpy().to_columns())
         for name in table.colnames:
             table[name].unit, table[name].description = COLUMNS[name]
+            if self.on_sky and name.startswith("size"):
+                table[name].unit = None  # that of the Jacobian, which is not said
         table.meta["RSTEP"] = self.step
         return table
 
@@ -159,6 +168,7 @@ def measure_responses(
     softening: float = 1.0,
     bound: float = 0.0,
     step: float = STEP,
+    jacobian: Array | None = None,
     padding: int = 1,
     chunk_size: int | None = None,
 ) -> ResponseResult:
@@ -175,6 +185,10 @@ def measure_responses(
         As for `population_null`, statistic "frozen".
     step : float
         Reduced shear h of the frames, up to 0.1. The differences err by a part of order h².
+
+    jacobian : array, shape (2, 2) or (n_gal, 2, 2), optional
+        `d(u, v)/d(x, y)` of the pixels, for all stamps or for each, as for `measure_shapes`: shear,
+        weight and noise made round are then those on the sky, `size` and sizes in its unit.
 
     Returns
     -------
@@ -210,6 +224,7 @@ def measure_responses(
         ),
         mask=mask,
         masked=masked,
+        jacobian=jacobian,
     )
     return _result(sample, step)
 
@@ -240,9 +255,10 @@ def _result(sample: FrameSample, step: float) -> ResponseResult:
     return ResponseResult(
         v=or_nan(seen[0].v),
         response=or_nan(xp.stack(slopes, axis=-1)),
-        centroid=or_nan(sample.job.length * seen[0].solution[:, -2:] + middle),
+        centroid=or_nan(seen[0].centroid + middle),
         flags=flags,
         step=step,
+        on_sky=sample.regular is not None,
         **quantities,
     )
 

@@ -7,27 +7,16 @@ from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Final, Literal, TypeAlias
 
-from fdnt_xp.arrays import (
-    Array,
-    array_namespace,
-    as_floating,
-    count_true,
-    device_of,
-    require_dtype,
-)
-from fdnt_xp.errors import (
-    FdntTypeError,
-    FdntValueError,
-    RangeError,
-    ShapeMismatchError,
-)
+from fdnt_xp.arrays import Array, array_namespace, count_true, device_of
+from fdnt_xp.errors import FdntTypeError, FdntValueError, RangeError, ShapeMismatchError
 from fdnt_xp.fourier.noise import PixelNoise
 from fdnt_xp.fourier.psf import Psf
 from fdnt_xp.shapes.job import check_count, check_options, check_stamps, galaxies_at_once, prepare
-from fdnt_xp.shapes.pixels import noise_column
+from fdnt_xp.shapes.pixels import noise_column, power_noise
 from fdnt_xp.shears.counter_shear import FrozenQuadrupole, SolvedEta
 from fdnt_xp.shears.frames import FrameSample, SampleNoise
 from fdnt_xp.shears.masks import Masked, SampleMask
+from fdnt_xp.shears.sky import SampleSky
 from fdnt_xp.shears.weights import ShapeWeight
 
 StatisticName: TypeAlias = Literal["frozen", "eta"]
@@ -82,6 +71,7 @@ def make_sample(
     noise: NoiseOptions,
     mask: Array | None = None,
     masked: Masked = "drop",
+    jacobian: Array | None = None,
 ) -> FrameSample:
     """Check everything, and choose weight, statistic and chunks.
 
@@ -97,6 +87,10 @@ def make_sample(
     _check_statistic(statistic, weight, softening=softening, bound=bound)
     sample_noise = _sample_noise(xp, stamps, noise)
     noisy = sample_noise is not None
+    sky = None if jacobian is None else SampleSky.of(xp, stamps, psf, jacobian)
+    unit_length = 1.0 if sky is None else sky.unit_length
+    psf = psf if sky is None else sky.psf
+    size = None if size is None else size / unit_length
     seen_by = psf.ending_at(_NOISY_FLOOR) if noisy else psf
     job = prepare(xp, stamps, seen_by, padding=padding, matched=statistic == "eta" and not noisy)
 
@@ -117,9 +111,11 @@ def make_sample(
             noise=sample_noise,
             # On the image the weight is convolved with something as wide as the PSF.
             mask=SampleMask.of(xp, stamps, mask, masked, math.hypot(frozen, job.length)),
+            regular=None if sky is None else sky.regular,
+            unit_length=unit_length,
         )
 
-    frozen_size = _PER_PSF * 3.0 / psf.largest_kmax if size is None else size
+    frozen_size = _PER_PSF * 3.0 / _widest(psf) if size is None else size
     if noisy and size is None:
         frozen_size = _size_for(under(frozen_size), frozen_size)
     sample = under(frozen_size)
@@ -151,6 +147,13 @@ def _check_statistic(
         raise FdntValueError('bound goes with statistic="frozen"; "eta" takes a weight')
 
 
+def _widest(psf: Psf) -> float:
+    """Return where the weight that reaches farthest ends, on the sky if there is one, rad/pixel."""
+    if psf.unit_jacobian is None or psf.n_psf == 0:
+        return psf.largest_kmax
+    return float(array_namespace(kmax=psf.kmax).max(psf.kmax))
+
+
 def default_size(
     stamps: Array,
     psf: Psf,
@@ -159,8 +162,11 @@ def default_size(
     noise_power: Array | None = None,
     max_shear: float = 0.1,
     padding: int = 1,
+    jacobian: Array | None = None,
 ) -> float:
-    """Return the size of the frozen weight that `population_null` takes by default, pixels.
+    """Return the size of the frozen weight that `population_null` takes by default.
+
+    In pixels, or with a Jacobian in the unit of the sky.
 
     1.15 times the median size, before the PSF, of some 400 galaxies all over the sample, but
     no less than about the size of the PSF and no more than a sixteenth of the stamp. Any size
@@ -171,7 +177,7 @@ def default_size(
 
     Parameters
     ----------
-    stamps, psf, noise_variance, noise_power, max_shear, padding
+    stamps, psf, noise_variance, noise_power, max_shear, padding, jacobian
         As for `population_null`; for `measure_responses` `max_shear` is its step.
 
     Raises
@@ -190,9 +196,10 @@ def default_size(
         padding=padding,
         chunk_size=None,
         noise=NoiseOptions(noise_variance=noise_variance, noise_power=noise_power),
+        jacobian=jacobian,
     )
     assert isinstance(sample.statistic, FrozenQuadrupole)
-    return sample.statistic.size
+    return sample.statistic.size * sample.unit_length
 
 
 def rows_for_size(n_gal: int) -> slice:
@@ -210,7 +217,7 @@ def _size_for(sample: FrameSample, psf_size: float) -> float:
     as_it_is = replace(sample, noise=replace(sample.noise, isotropise=False))
     some = as_it_is.take(xp.arange(rows.start, rows.stop, rows.step, **every))
     (seen,) = some.evaluate(((0.0, 0.0),))
-    sizes = seen.quantities.size
+    sizes = seen.quantities.size / sample.unit_length
     known = xp.isfinite(sizes)
     n_known = count_true(known)
     if n_known == 0:
@@ -229,7 +236,7 @@ def _sample_noise(xp: ModuleType, stamps: Array, options: NoiseOptions) -> Sampl
     if options.noise_variance is not None and options.noise_power is not None:
         raise FdntValueError("give noise_variance or noise_power, not both")
     if options.noise_power is not None:
-        pixels = _correlated(xp, stamps, options.noise_power)
+        pixels = power_noise(xp, stamps, options.noise_power)
     elif options.noise_variance is None:
         if options.isotropise:
             raise FdntValueError("isotropise needs noise_variance or noise_power")
@@ -265,29 +272,6 @@ def _variances(xp: ModuleType, stamps: Array, given: float | Array) -> Array | N
     if not bool(xp.all(xp.isfinite(variance) & (variance >= 0))):
         raise FdntValueError("noise_variance must be finite and not negative, for each galaxy")
     return variance if bool(xp.any(variance > 0)) else None
-
-
-def _correlated(xp: ModuleType, stamps: Array, power: Array) -> PixelNoise:
-    """Return the noise of a power spectrum, checked."""
-    array_namespace(stamps=stamps, noise_power=power)
-    power = as_floating(xp, power, "noise_power")
-    require_dtype(stamps.dtype, noise_power=power)
-    n_gal, ny, nx = (int(n) for n in stamps.shape)
-    if power.shape not in ((ny, nx), (n_gal, ny, nx)):
-        raise ShapeMismatchError(
-            f"noise_power must have the shape ({ny}, {nx}) or ({n_gal}, {ny}, {nx}), "
-            f"not {tuple(power.shape)}"
-        )
-    power = xp.reshape(power, (-1, ny, nx))
-    if not bool(xp.all(xp.isfinite(power) & (power >= 0)) & xp.any(power > 0)):
-        raise FdntValueError("noise_power must be finite, not negative, and not all 0")
-    # -k is at the index (-j) mod n, along both axes.
-    mirrored = xp.roll(xp.flip(power, axis=(-2, -1)), (1, 1), axis=(-2, -1))
-    if not bool(xp.all(xp.abs(power - mirrored) <= 1e-3 * xp.max(power))):
-        raise FdntValueError(
-            "noise_power must be the same at k and -k, in the order of the FFT (k = 0 first)"
-        )
-    return PixelNoise.of_power(power, n_gal)
 
 
 def _whole_numbers(xp: ModuleType, stamps: Array, name: str, given: Array | None) -> Array | None:

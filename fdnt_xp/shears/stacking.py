@@ -44,6 +44,7 @@ from fdnt_xp.shapes.job import (
 )
 from fdnt_xp.shapes.results import ShapeResult
 from fdnt_xp.shapes.search import solve
+from fdnt_xp.shapes.sky import sky_frame
 from fdnt_xp.shapes.solution import describe
 from fdnt_xp.shear import reduced_shear_from_eta
 from fdnt_xp.shears.estimate import ShearEstimate
@@ -64,6 +65,7 @@ def shear_from_stack(
     galaxy_weight: Array | None = None,
     normalise: bool = False,
     n_groups: int = 20,
+    jacobian: Array | None = None,
     padding: int = 1,
     chunk_size: int | None = None,
 ) -> ShearEstimate:
@@ -93,6 +95,9 @@ def shear_from_stack(
         stack is biased: by 3 % in GREAT08.
     n_groups : int
         Groups of the jackknife: consecutive stamps, so that pairs stay together.
+    jacobian : array, shape (2, 2), optional
+        `d(u, v)/d(x, y)` of the pixels, as for `measure_shapes`: the shear is then that on the
+        sky. One for all stamps: what is stacked has to be on one grid.
     padding : int
         Makes the k grid finer by this factor.
     chunk_size : int, optional
@@ -138,6 +143,7 @@ def shear_from_stack(
     everyone = xp.ones(n_gal, dtype=xp.bool, device=device_of(stamps))
     weights = xp.astype(galaxy_weights(everyone, galaxy_weight), stamps.dtype)
     centres = _from_the_middle(xp, stamps, centroids)
+    psf = psf if jacobian is None else _on_sky(xp, stamps, psf, jacobian)
 
     job = prepare(xp, stamps, psf, padding=padding, max_iter=_MAX_ITER)
     sample = _Sample(
@@ -157,6 +163,17 @@ def shear_from_stack(
             stacklevel=2,
         )
     return _estimate(stack, shapes)
+
+
+def _on_sky(xp: ModuleType, stamps: Array, psf: Psf, jacobian: Array) -> Psf:
+    """Return the PSF with weights that are round on the sky."""
+    frame = sky_frame(xp, stamps, int(stamps.shape[0]), jacobian)
+    if jacobian.ndim != 2:
+        raise ShapeMismatchError(
+            f"jacobian must have the shape (2, 2), one for all of a stack, not "
+            f"{tuple(jacobian.shape)}"
+        )
+    return frame.seen_by(psf)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import fdnt_xp as fx
+from fdnt_xp.errors import ShapeMismatchError
 from fdnt_xp.shear import eta_from_matrix, shear_matrix
 from science.galsim_images import ACCURATE
 
@@ -71,6 +72,73 @@ def test_a_galaxy_has_one_shape_through_any_pixels(name, drawn):
         np.testing.assert_allclose(shapes.e, [[0.3, 0.2]] * len(JACOBIANS), atol=1e-6)
     else:
         assert abs(shapes.eg[0]) > 0.01  # there is a gradient
+
+
+G = (0.03, -0.02)
+N_ANGLES = 8
+
+
+@pytest.fixture(scope="module")
+def rings():
+    """Return half a turn of the galaxy with a gradient, sheared, through each of the Jacobians.
+
+    Stamps (n_jacobian, n_angle, ny, nx), and the stars.
+    """
+    psf = galsim.Gaussian(half_light_radius=0.5, gsparams=ACCURATE).shear(e1=0.1, e2=0.08)
+    galaxy = galaxies()["gradient"]
+    seen = []
+    for angle in np.arange(N_ANGLES) * (180.0 / N_ANGLES):
+        lensed = galaxy.rotate(angle * galsim.degrees).shear(g1=G[0], g2=G[1]).shift(0.06, -0.05)
+        seen.append(galsim.Convolve([lensed, psf], gsparams=ACCURATE))
+    stamps = np.stack([[draw(one, j, 96) for one in seen] for j in JACOBIANS])
+    return stamps, np.stack([draw(psf, j, 96) for j in JACOBIANS])
+
+
+@pytest.mark.parametrize("number", range(len(JACOBIANS)))
+def test_the_shear_of_a_ring_is_that_on_the_sky(number, rings):
+    stamps, psf = rings[0][number], fx.Psf.from_image(rings[1][number])
+    for statistic in ("frozen", "eta"):
+        null = fx.population_null(stamps, psf, jacobian=JACOBIANS[number], statistic=statistic)
+        np.testing.assert_allclose(null.g, G, atol=1e-7)
+    stack = fx.shear_from_stack(stamps, psf, jacobian=JACOBIANS[number])
+    np.testing.assert_allclose(stack.g, G, atol=1e-6)
+    on_pixels = fx.population_null(stamps, psf)
+    if number in (1, 2, 3, 4, 5):  # mirrored, turned, sheared, not square
+        assert np.max(np.abs(on_pixels.g - G)) > 0.01
+
+
+def test_responses_do_not_depend_on_the_pixels(rings):
+    seen = [
+        fx.measure_responses(stamps, fx.Psf.from_image(star), jacobian=j, size=0.6)
+        for stamps, star, j in zip(*rings, JACOBIANS, strict=True)
+    ]
+    for one in seen[1:]:
+        # Jacobians are rounded to 1/8192 for the weights: a part in 10^5 of v, the same for all.
+        np.testing.assert_allclose(one.v, seen[0].v, atol=3e-6)
+        np.testing.assert_allclose(one.response, seen[0].response, atol=3e-5)
+        np.testing.assert_allclose(one.size, seen[0].size, rtol=3e-5)
+    middle = [[0.06, -0.05]]
+    for one, j in zip(seen, JACOBIANS, strict=True):
+        # The galaxy looks the same upside down: its centroid follows the shear.
+        np.testing.assert_allclose((one.centroid - 47.5) @ j.T, middle * N_ANGLES, atol=1e-5)
+
+
+def test_galaxies_each_behind_pixels_of_its_own(rings):
+    stamps, stars = rings
+    # All angles through all Jacobians; and one Jacobian for each angle, a ring only on the sky.
+    which = np.repeat(np.arange(len(JACOBIANS)), N_ANGLES)
+    psf = fx.Psf.from_image(stars, psf_index=which)
+    every = stamps.reshape(-1, *stamps.shape[2:])
+    null = fx.population_null(every, psf, jacobian=JACOBIANS[which])
+    np.testing.assert_allclose(null.g, G, atol=1e-7)
+    some = np.arange(N_ANGLES) % len(JACOBIANS)
+    mixed = stamps[some, np.arange(N_ANGLES)]
+    psf = fx.Psf.from_image(stars, psf_index=some)
+    for statistic in ("frozen", "eta"):
+        null = fx.population_null(mixed, psf, jacobian=JACOBIANS[some], statistic=statistic)
+        np.testing.assert_allclose(null.g, G, atol=2e-6)
+    with pytest.raises(ShapeMismatchError, match="one for all of a stack"):
+        fx.shear_from_stack(mixed, psf, jacobian=JACOBIANS[some])
 
 
 def test_moving_the_shape_of_the_pixels_is_not_the_same(drawn):

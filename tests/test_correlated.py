@@ -1,0 +1,168 @@
+"""Noise that is correlated between pixels: errors of shapes, and spectra that are none.
+
+What noise does to a shape is `g C gᵀ`, with g the derivative of eta by each pixel, which is
+taken here by differences, and C the covariance of the pixels.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from array_api_extra.testing import assert_close
+
+import fdnt_xp as fx
+from fdnt_xp.errors import FdntValueError, NamespaceError, ShapeMismatchError
+from fdnt_xp.flags import flag_names
+from images import galaxies, star
+from tolerances import tolerance
+
+N = 28
+E = np.array([[0.25, -0.2], [0.0, 0.1], [0.5, 0.3]])
+RADII = (1.2, 0.7)
+"""Of the smoothing along x and y, pixels."""
+
+
+def correlation(lag_y, lag_x):
+    """Return the correlation function of white noise smoothed by a Gaussian."""
+    return np.exp(-0.25 * ((lag_x / RADII[0]) ** 2 + (lag_y / RADII[1]) ** 2))
+
+
+def covariance(n=N):
+    """Return the covariance of the pixels of a stamp, row by row; shape (n², n²)."""
+    y, x = (i.ravel() for i in np.indices((n, n)))
+    return correlation(y[:, None] - y, x[:, None] - x)
+
+
+def power(n=N):
+    """Return `E|FFT|²/n²` of stamps of such noise: pair of pixels by pair of pixels."""
+    waves = np.exp(-2j * np.pi * np.outer(np.arange(n), np.arange(n)) / n)
+    both = np.kron(waves, waves)
+    expected = np.sum((both @ covariance(n)) * both.conj(), axis=1).real.reshape(n, n) / n**2
+    return 0.5 * (expected + np.roll(np.flip(expected), (1, 1), axis=(0, 1)))
+
+
+@pytest.fixture(scope="module")
+def sample():
+    return galaxies(E, (N, N), sigma=1.6, centres=np.array([[0.2, -0.1], [0.0, 0.3], [0, 0]]))
+
+
+@pytest.fixture(scope="module")
+def psf():
+    return fx.Psf.from_image(star((N, N)))
+
+
+@pytest.mark.parametrize("options", [{}, {"padding": 2}, {"transform": "gl"}], ids=str)
+def test_errors_are_those_of_the_noise_of_the_pixels(options, sample, psf):
+    stamp = sample[0]
+    step = 1e-4 * np.max(stamp)
+    moved = step * np.eye(N * N).reshape(-1, N, N)
+    up, down = (fx.measure_shapes(stamp + sign * moved, psf) for sign in (1.0, -1.0))
+    by_pixel = (up.eta - down.eta).T / (2.0 * step)
+    expected = by_pixel @ covariance() @ by_pixel.T
+    shapes = fx.measure_shapes(stamp[None], psf, noise_power=power(), **options)
+    error = np.sqrt(np.diag(expected))
+    # The weight ends a little beyond the stamp. The derivatives are those of the coarse grid
+    # and of the stamp, not of a fit to it.
+    atol = 2e-3 if options else 1e-4
+    np.testing.assert_allclose(
+        shapes.eta_cov[0] / np.outer(error, error),
+        expected / np.outer(error, error),
+        rtol=0,
+        atol=atol,
+    )
+    white = fx.measure_shapes(stamp[None], psf, noise_variance=1.0)
+    assert np.all(np.diag(white.eta_cov[0]) < 0.5 * np.diag(expected))
+
+
+def test_the_flux_under_a_fixed_weight(sample, psf):
+    stamp = sample[0]
+    options = {"size": 1.7, "noise_power": power()}
+    shape = fx.measure_shapes(stamp[None], psf, **options)
+    # With eta and centroid where they are, flux is linear: white noise gives the norm of g.
+    rng = np.random.default_rng(5)
+    root = np.linalg.cholesky(covariance() + 1e-9 * np.eye(N * N))
+    noise = 1e-4 * np.max(stamp) * (rng.standard_normal((1500, N * N)) @ root.T).reshape(-1, N, N)
+    noisy = fx.measure_shapes(stamp + np.concatenate([noise, -noise]), psf, size=1.7)
+    scatter = np.std(noisy.flux) / (1e-4 * np.max(stamp))
+    assert scatter == pytest.approx(float(shape.flux[0] / shape.snr[0]), rel=0.05)
+
+
+def test_a_white_spectrum_is_a_variance(sample, xp, dtype, to_xp):
+    stamps = to_xp(sample, dtype)
+    psf = fx.Psf.from_image(to_xp(star((N, N)), dtype))
+    variances = np.array([1e-6, 4e-6, 2e-6])
+    flat = to_xp(np.broadcast_to(variances[:, None, None], (3, N, N)).copy(), dtype)
+    for transform in ("ft", "gl", "hybrid"):
+        white = fx.measure_shapes(
+            stamps, psf, noise_variance=to_xp(variances, dtype), transform=transform
+        )
+        by_power = fx.measure_shapes(stamps, psf, noise_power=flat, transform=transform)
+        rtol = 1e-3 if "32" in str(dtype) else 1e-9
+        if transform == "gl":
+            rtol = 3e-3  # functions that reach out of the stamp a little
+        assert_close(by_power.eta_cov, white.eta_cov, rtol=rtol, atol=1e-9, xp=xp)
+        assert_close(by_power.snr, white.snr, rtol=rtol, xp=xp)
+        assert_close(by_power.eta, white.eta, **tolerance("batch", dtype), xp=xp)
+
+
+@pytest.mark.parametrize("transform", ["ft", "gl"])
+def test_one_spectrum_for_each_and_chunks(transform, sample, psf):
+    one = power()
+    factors = np.array([1.0, 3.0, 0.5])
+    together = fx.measure_shapes(sample, psf, noise_power=one, transform=transform)
+    each = fx.measure_shapes(
+        sample,
+        psf,
+        noise_power=one * factors[:, None, None],
+        transform=transform,
+        chunk_size=2,
+    )
+    np.testing.assert_allclose(
+        each.eta_cov, together.eta_cov * factors[:, None, None], rtol=1e-7, atol=1e-12
+    )
+    shared = fx.Psf.from_image(star((N, N))[None], psf_index=np.zeros(3, dtype=np.int64))
+    again = fx.measure_shapes(sample, shared, noise_power=one, transform=transform)
+    np.testing.assert_allclose(again.eta_cov, together.eta_cov, rtol=1e-9)
+
+
+def test_noise_does_not_know_of_the_sky(sample, psf):
+    # Mirrored pixels: the errors are those of the pixels, with the sign of eta2 changed.
+    plain = fx.measure_shapes(sample, psf, noise_power=power())
+    sky = fx.measure_shapes(sample, psf, noise_power=power(), jacobian=np.diag([-1.0, 1.0]))
+    moved = np.diag([1.0, -1.0])
+    np.testing.assert_allclose(sky.eta_cov, moved @ plain.eta_cov @ moved, rtol=1e-7, atol=1e-9)
+
+
+def test_an_elongated_galaxy_on_the_fine_grid(psf):
+    stamp = galaxies(np.array([[0.0, -0.92]]), (N, N), sigma=1.9)
+    shapes = fx.measure_shapes(stamp, psf, noise_power=power())
+    assert "FINE_GRID" in flag_names(int(shapes.flags[0]))
+    fine = fx.measure_shapes(stamp, psf, noise_power=power(), padding=2)
+    np.testing.assert_allclose(
+        np.diagonal(shapes.eta_cov[0]), np.diagonal(fine.eta_cov[0]), rtol=0.01
+    )
+
+
+def test_calls_that_mean_nothing(sample, to_xp):
+    stamps, psf = to_xp(sample), fx.Psf.from_image(to_xp(star((N, N))))
+
+    def measure(spectrum, **options):
+        return fx.measure_shapes(stamps, psf, noise_power=to_xp(spectrum), **options)
+
+    good = np.ones((N, N))
+    for shape in ((N, N - 1), (2, N, N), (1, N, N), (N,)):
+        with pytest.raises(ShapeMismatchError, match="noise_power must have the shape"):
+            measure(np.ones(shape))
+    bad = [-good, 0.0 * good, np.where(np.eye(N) > 0, np.nan, good)]
+    bad.append(np.stack([good, 0.0 * good, good]))
+    for spectrum in bad:
+        with pytest.raises(FdntValueError, match="finite, not negative, and not all 0"):
+            measure(spectrum)
+    with pytest.raises(FdntValueError, match="k and -k"):
+        measure(np.arange(float(N * N)).reshape(N, N))
+    for other in ({"noise_variance": 1.0}, {"ivar": to_xp(np.ones((3, N, N)))}):
+        with pytest.raises(FdntValueError, match="noise_power cannot be given with"):
+            measure(good, **other)
+    with pytest.raises(NamespaceError, match="noise_power"):
+        fx.measure_shapes(stamps, psf, noise_power=to_xp(good, "float32"))
+    assert fx.measure_shapes(stamps[:0, ...], psf, noise_power=to_xp(good)).n_gal == 0
