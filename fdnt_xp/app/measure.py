@@ -156,8 +156,12 @@ def open_source(inputs: Inputs) -> StampSource:
     return cube_stamps(pixels)
 
 
-def find_jacobians(inputs: Inputs, source: StampSource) -> NDArray[np.float64] | None:
+def find_jacobians(inputs: Inputs, method: str, source: StampSource) -> NDArray[np.float64] | None:
     """Return the Jacobian of all pixels, (2, 2), or at each galaxy, (n_gal, 2, 2), if wanted."""
+    if (inputs.wcs or inputs.jacobian is not None) and method not in SHAPES_ON_SKY:
+        raise FdntValueError(
+            f"--jacobian and --wcs are for --method {', '.join(SHAPES_ON_SKY)} and --responses"
+        )
     if inputs.wcs:
         if inputs.jacobian is not None or inputs.layout == "cube":
             raise FdntValueError("--wcs wants positions on an image, and no --jacobian")
@@ -197,11 +201,7 @@ def measure_files(inputs: Inputs, settings: Settings) -> tuple[Table, float]:
     coloured = None
     if noise.power is not None and ivar is None:
         coloured = method_in_noise(settings.method, backend.from_numpy(noise.power))
-    jacobians = find_jacobians(inputs, source)
-    if jacobians is not None and settings.method not in SHAPES_ON_SKY:
-        raise FdntValueError(
-            f"--jacobian and --wcs are for --method {', '.join(SHAPES_ON_SKY)} and --responses"
-        )
+    jacobians = find_jacobians(inputs, settings.method, source)
     start = time.perf_counter()
     if settings.responses:
         table = measure_source_responses(
