@@ -14,6 +14,7 @@ from fdnt_xp.data.stamps import StampSource, cube_stamps, grid_stamps, position_
 from fdnt_xp.data.tables import read_positions
 from fdnt_xp.data.wcs import wcs_jacobians
 from fdnt_xp.errors import CatalogError, FdntValueError
+from fdnt_xp.shapes.methods import NULL_TEST_METHODS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,8 +157,12 @@ def open_source(inputs: Inputs) -> StampSource:
     return cube_stamps(pixels)
 
 
-def find_jacobians(inputs: Inputs, source: StampSource) -> NDArray[np.float64] | None:
+def find_jacobians(inputs: Inputs, method: str, source: StampSource) -> NDArray[np.float64] | None:
     """Return the Jacobian of all pixels, (2, 2), or at each galaxy, (n_gal, 2, 2), if wanted."""
+    if (inputs.wcs or inputs.jacobian is not None) and method not in NULL_TEST_METHODS:
+        raise FdntValueError(
+            f"--jacobian and --wcs are for --method {', '.join(NULL_TEST_METHODS)} and --responses"
+        )
     if inputs.wcs:
         if inputs.jacobian is not None or inputs.layout == "cube":
             raise FdntValueError("--wcs wants positions on an image, and no --jacobian")

@@ -172,11 +172,6 @@ def _check(inputs: Inputs, settings: Settings) -> None:
         raise FdntValueError("--method chooses how shapes are measured, not --responses")
     if settings.responses and (inputs.mask or inputs.weight):
         raise FdntValueError("--mask and --weight are for shapes, not for --responses")
-    on_sky = inputs.wcs or inputs.jacobian is not None
-    if on_sky and settings.method not in NULL_TEST_METHODS:
-        raise FdntValueError(
-            f"--jacobian and --wcs are for --method {', '.join(NULL_TEST_METHODS)} and --responses"
-        )
 
 
 def _make_plan(inputs: Inputs, settings: Settings) -> tuple[Plan, Work]:
@@ -191,7 +186,8 @@ def _make_plan(inputs: Inputs, settings: Settings) -> tuple[Plan, Work]:
     noise = find_noise(source, settings.noise_variance, blank, mask=mask, mapped=mapped)
     size = settings.size
     if settings.responses:
-        size = size or common_size(source, psfs, noise, find_jacobians(inputs, source))
+        jacobians = find_jacobians(inputs, settings.method, source)
+        size = size or common_size(source, psfs, noise, jacobians)
     plan = Plan(
         inputs=inputs.absolute(),
         settings=settings,
@@ -211,7 +207,7 @@ def _open(inputs: Inputs, settings: Settings) -> tuple[StampSource, ChunkPsfs]:
 
 def _prepare(plan: Plan, source: StampSource, psfs: ChunkPsfs) -> Work:
     inputs, settings, noise = plan.inputs, plan.settings, plan.noise
-    jacobians = find_jacobians(inputs, source)
+    jacobians = find_jacobians(inputs, settings.method, source)
     if settings.responses:
         measure = response_measurer(
             source,

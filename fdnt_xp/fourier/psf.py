@@ -30,6 +30,9 @@ from fdnt_xp.fourier.transform import complex_like, half_plane_axes, mode_phase
 
 _UNIT_STEPS = 8192.0
 """Of an entry of a unit Jacobian, to one: pixels that differ by less share tables."""
+_COMMON_STEPS = 2048.0
+"""The same where many Jacobians have a unit of length in common: a mean shear does not ask for
+weights that are more alike, and its error by a table is as random as the rounding."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,8 +201,9 @@ class Psf:
         """Return the PSFs with weights that are round on the sky.
 
         The tables are made once for each different pair of a PSF and a unit Jacobian, with
-        entries rounded to 1/8192: the weight needs to be the same for the same galaxy, and
-        smooth, not round to more than that. All else has the Jacobian as it is.
+        entries rounded to 1/8192 (1/2048 for many, with a `unit_length`): the weight needs to be
+        the same for the same galaxy, and smooth, not round to more than that. All else has the
+        Jacobian as it is.
 
         Parameters
         ----------
@@ -220,7 +224,9 @@ class Psf:
             unit = xp.take(unit, rows, axis=0)
             numbers = xp.zeros_like(rows) if self.n_gal is None else self.numbers_of(rows)
             seen = replace(self, index=None).take(numbers)
-        rounded = xp.round(unit * _UNIT_STEPS) / _UNIT_STEPS
+        many = unit_length is not None and int(jacobian.shape[0]) > 1
+        steps = _COMMON_STEPS if many else _UNIT_STEPS
+        rounded = xp.round(unit * steps) / steps
         rounded = unit_jacobian(rounded) if unit_length is None else rounded
         rows, table = _different(numbers, rounded)
         kmax, weight, ln_power = circle_tables(

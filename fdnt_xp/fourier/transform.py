@@ -56,6 +56,9 @@ def deconvolve(stamps: Array, inverse_transfer: Array, grid: KGrid) -> Deconvolv
     """
     xp = array_namespace(stamps=stamps)
     n_gal, ny, nx = (int(length) for length in stamps.shape)
+    if n_gal == 0:  # which PyTorch does not transform
+        none = xp.zeros((0, grid.n_k), dtype=stamps.dtype, device=device_of(stamps))
+        return DeconvolvedStamps(re=none, im=none)
     # Pixel (0, 0) is at -middle from the centre of the stamp, which is where x = 0.
     middle = xp.asarray(
         [[-0.5 * (nx - 1), -0.5 * (ny - 1)]], dtype=stamps.dtype, device=device_of(stamps)
