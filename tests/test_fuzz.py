@@ -123,11 +123,6 @@ def test_a_damaged_stamp_changes_no_other(stamps, place):
 
 # --- files --------------------------------------------------------------------------------
 
-pytestmark = pytest.mark.filterwarnings(
-    # Astropy leaves a file that is broken open until it is collected.
-    "ignore::pytest.PytestUnraisableExceptionWarning"
-)
-
 CUBE = ("measure", "cube.fits", "--psf", "psf.fits", "-o", "out.fits", "--noise-variance", "1e-6")
 AROUND = (
     *("measure", "image.fits", "--psf", "psf.fits", "-o", "out.fits", "--noise-variance", "1e-6"),
@@ -162,7 +157,7 @@ def refused_or_done(arguments, *, refused=None):
         assert (result.exit_code != 0) is refused, result.output
     after = {file: file.is_file() and file.read_bytes() for file in Path().iterdir()}
     if result.exit_code == 0:
-        assert set(after) - set(before) <= {Path("out.fits")}
+        assert set(after) - set(before) <= {Path("out.fits"), Path("nowhere.fits")}
         return
     assert after == before
     lines = [line for line in result.output.splitlines() if line.startswith("Error: ")]
@@ -275,7 +270,8 @@ _OPTIONS = [
 @given(st.lists(st.tuples(st.sampled_from(_OPTIONS), st.sampled_from(_WORDS)), max_size=3))
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_odd_options_are_refused_or_measured(folder, options):
-    Path("out.fits").unlink(missing_ok=True)
+    for name in ("out.fits", "nowhere.fits"):
+        Path(name).unlink(missing_ok=True)
     if any(option == ("--jobs", "7") for option in options):
         return  # it is right, and slow
     refused_or_done([*CUBE, *(word for option in options for word in option)])

@@ -21,13 +21,16 @@ from fdnt_xp.app.backends import load_backend
 from fdnt_xp.app.chunks import ChunkSize
 from fdnt_xp.app.cli import main
 from fdnt_xp.app.noise import find_noise
-from fdnt_xp.app.runner import measure_source
+from fdnt_xp.app.runner import IMAGE_COLUMNS, measure_source
 from fdnt_xp.data import row_batches
 from fdnt_xp.data.catalog import read_catalog
 from fdnt_xp.data.stamps import cube_stamps
 from fdnt_xp.errors import FdntError, FdntWarning, RangeError
+from fdnt_xp.flags import Flag
 from fdnt_xp.shapes.measure import measure_shapes
-from images import galaxies, star
+from fdnt_xp.shapes.results import COLUMNS, PSF_COLUMNS
+from fdnt_xp.shears.responses import COLUMNS as RESPONSES
+from images import galaxies, gaussian_covariance, gaussian_image, star
 
 SIZE = 24
 N_GAL = 22
@@ -99,6 +102,8 @@ def test_parts_make_what_one_call_does(suffix, kind, folder, stamps):
     assert not (folder / f"out{suffix}.parts").exists()
     table = read_catalog(f"out{suffix}")
     assert table["id"].tolist() == list(range(N_GAL))
+    measured = {*(RESPONSES if kind else COLUMNS), *IMAGE_COLUMNS, *PSF_COLUMNS}
+    assert set(table.colnames) == measured
     if kind:
         return
     variance = find_noise(cube_stamps(stamps)).variance
@@ -109,6 +114,31 @@ def test_parts_make_what_one_call_does(suffix, kind, folder, stamps):
     ).to_table()
     for name in ("eta1", "e2", "flux", "snr", "flags", "masked_fraction"):
         np.testing.assert_allclose(table[name], shapes[name], rtol=1e-8, atol=1e-9)
+
+
+def test_the_shape_of_the_psf_is_beside_that_of_each_galaxy(folder):
+    """By the covariance of the Gaussians that the stars are."""
+    rng = np.random.default_rng(8)
+    e = rng.uniform(-0.2, 0.2, (N_GAL, 2))
+    sigma = rng.uniform(1.4, 1.8, N_GAL)
+    stars = [
+        gaussian_image(gaussian_covariance(tuple(one), s), (SIZE, SIZE))
+        for one, s in zip(e, sigma, strict=True)
+    ]
+    stars[9] *= np.nan
+    fits.PrimaryHDU(np.stack(stars)).writeto("psfs.fits")
+    run(*MEASURE[:3], "psfs.fits", *MEASURE[4:], "-o", "out.fits")
+    table = read_catalog("out.fits")
+    norm = np.linalg.norm(e, axis=-1)
+    eta = e * (np.arctanh(norm) / norm)[:, None]
+    size = sigma * (1.0 - norm**2) ** 0.25
+    expected = {"psf_eta1": eta[:, 0], "psf_eta2": eta[:, 1], "psf_size": size}
+    usable = np.arange(N_GAL) != 9
+    for name, values in expected.items():
+        # The stars' wings are cut by the edge of their images.
+        np.testing.assert_allclose(table[name][usable], values[usable], atol=2e-4)
+        assert np.isnan(table[name][9])
+    assert table["flags"][9] == int(Flag.BAD_PSF)
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from click.testing import CliRunner
 
 import fdnt_xp as fx
 from conftest import selected_backends
+from fdnt_xp.app import noise as noise_module
 from fdnt_xp.app.backends import load_backend
 from fdnt_xp.app.cli import main
 from fdnt_xp.app.noise import Noise, find_noise
@@ -295,6 +296,26 @@ def test_noise_of_the_source_and_of_blank_sky():
 
 
 # --- shear ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("layout", ["image", "cube"])
+def test_much_blank_sky_is_sampled(layout, monkeypatch):
+    """Evenly, whatever there is of it, so that memory is bounded."""
+    rng = np.random.default_rng(4)
+    source = cube_stamps(np.zeros((1, 16, 20)))
+    n_rows, n_columns = 40, 5
+    scale = np.repeat(np.linspace(0.5, 1.5, n_rows), n_columns)[:, None, None]
+    stamps = scale * rng.standard_normal((n_rows * n_columns, 16, 20))
+    blank = stamps
+    if layout == "image":
+        cells = stamps.reshape(n_rows, n_columns, 16, 20)
+        blank = np.pad(cells.swapaxes(1, 2).reshape(n_rows * 16, -1), ((0, 7), (0, 3)))
+    whole = find_noise(source, blank=blank)
+    assert whole.blank.n_stamps + whole.blank.n_rejected == 200
+    monkeypatch.setattr(noise_module, "_BLANK_BYTES", 100 * 16 * 20 * 8)
+    part = find_noise(source, blank=blank)
+    assert part.blank.n_stamps + part.blank.n_rejected == 100
+    assert part.variance == pytest.approx(whole.variance, rel=0.05)
 
 
 @pytest.fixture

@@ -12,7 +12,11 @@ from sphinx.util.docutils import SphinxDirective
 
 import fdnt_xp
 from fdnt_xp.app.cli import main
+from fdnt_xp.app.runner import IMAGE_COLUMNS
+from fdnt_xp.data.provenance import COMMENTS
 from fdnt_xp.flags import FAILED, Flag
+from fdnt_xp.shapes.results import COLUMNS, PSF_COLUMNS, SKY_COLUMNS
+from fdnt_xp.shears.responses import COLUMNS as RESPONSES
 
 
 class FlagTable(SphinxDirective):
@@ -45,6 +49,38 @@ class PublicNames(SphinxDirective):
         return self.parse_text_to_nodes("\n".join(lines))
 
 
+class ColumnTable(SphinxDirective):
+    """The columns of catalogs, each with its unit and description, by groups."""
+
+    required_arguments = 1
+
+    def run(self) -> list[nodes.Node]:
+        """Return the table of the group that is named."""
+        lines = ["| column | unit | meaning |", "|---|---|---|"]
+        for name, (unit, text) in COLUMN_GROUPS[self.arguments[0]].items():
+            lines.append(f"| `{name}` | {unit or ''} | {text.replace('|', chr(92) + '|')} |")
+        return self.parse_text_to_nodes("\n".join(lines))
+
+
+class HeaderTable(SphinxDirective):
+    """The keywords of the header of a catalog, each with its meaning."""
+
+    def run(self) -> list[nodes.Node]:
+        """Return the table."""
+        lines = ["| keyword | meaning |", "|---|---|"]
+        lines += [f"| `{name}` | {text} |" for name, text in COMMENTS.items()]
+        return self.parse_text_to_nodes("\n".join(lines))
+
+
+COLUMN_GROUPS = {
+    "image": IMAGE_COLUMNS,
+    "shapes": {name: of for name, of in COLUMNS.items() if name not in IMAGE_COLUMNS},
+    "sky": SKY_COLUMNS,
+    "psf": PSF_COLUMNS,
+    "responses": {name: of for name, of in RESPONSES.items() if name not in IMAGE_COLUMNS},
+}
+
+
 class CommandHelp(SphinxDirective):
     """What `--help` prints, for the command and each of its subcommands."""
 
@@ -69,7 +105,9 @@ def _contexts(
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Register the directives."""
+    app.add_directive("column-table", ColumnTable)
     app.add_directive("flag-table", FlagTable)
+    app.add_directive("header-table", HeaderTable)
     app.add_directive("public-names", PublicNames)
     app.add_directive("command-help", CommandHelp)
     return {"parallel_read_safe": True}

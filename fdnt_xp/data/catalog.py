@@ -86,7 +86,8 @@ def check_catalog(path: str | os.PathLike[str], *, overwrite: bool = False) -> N
 
 
 def _read_fits(path: Path) -> Table:
-    with fits.open(path, memmap=False) as hdus:
+    # Astropy leaves a file that is broken open, unless it is ours to close.
+    with path.open("rb") as file, fits.open(file, memmap=False) as hdus:
         number = next(i for i, hdu in enumerate(hdus) if isinstance(hdu, fits.BinTableHDU))
         table = Table.read(hdus[number], mask_invalid=False, character_as_bytes=False)
     table.meta.pop("EXTNAME", None)

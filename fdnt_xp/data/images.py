@@ -162,7 +162,8 @@ def _split(path: str | os.PathLike[str]) -> tuple[Path, str | int | None]:
 
 
 def _first_image(file: Path, extension: str | int | None, what: str) -> Pixels:
-    with fits.open(file, memmap=True) as hdus:
+    # Astropy leaves a file that is broken open, unless it is ours to close.
+    with file.open("rb") as stream, fits.open(stream, memmap=True) as hdus:
         if extension is not None:
             if extension not in hdus if isinstance(extension, str) else extension >= len(hdus):
                 names = ", ".join(f"{i} {hdu.name}".strip() for i, hdu in enumerate(hdus))
@@ -186,7 +187,7 @@ def _first_image(file: Path, extension: str | int | None, what: str) -> Pixels:
                 if "memory-map" not in str(error):
                     raise
     # Pixels that are packed, or stored scaled (BZERO, BSCALE), have to be computed.
-    with fits.open(file, memmap=False) as hdus:
+    with file.open("rb") as stream, fits.open(stream, memmap=False) as hdus:
         hdu = hdus[index]
         first = np.asarray(hdu.section[:1])
         if first.nbytes * hdu.shape[0] > fits_pixels.IN_MEMORY:
