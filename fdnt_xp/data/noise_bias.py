@@ -213,7 +213,7 @@ def noise_bias(
     ) as bar:
         for number in range(n_batches):
             seeds = [seed, versions.population.seed, number, round(1000 * snr)]
-            pair = _noisy_pair(versions, number, batch, sigma, seeds)
+            pair = noisy_pair(versions, number, batch, sigma, seeds)
             if observed_cut is not None:
                 pair = _cut_as_seen(pair, settings, observed_cut)
             for tally in tallies.values():
@@ -238,10 +238,21 @@ def _one_or_all(images: NDArray[np.float64]) -> NDArray[np.float64]:
     return images[0] if len(images) == 1 else images
 
 
-def _noisy_pair(
+def noisy_pair(
     versions: Versions, number: int, batch: int, sigma: float, seed: list[int]
 ) -> tuple[NoisyStamps, NoisyStamps]:
-    """Return the stamps of a batch with shear +g, and those with -g."""
+    """Return the stamps of a batch with shear +g, and those with -g.
+
+    Parameters
+    ----------
+    versions : Versions
+    number, batch : int
+        Which batch; galaxies in it.
+    sigma : float
+        Of the noise of a pixel.
+    seed : list of int
+        Of the noise.
+    """
     rng = np.random.default_rng(seed)
     names = number * batch + np.arange(batch)
     rows = names % versions.population.n_gal
