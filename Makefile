@@ -40,7 +40,8 @@ test-gpu: $(VENV)/.dev ## the test suite on the GPU (GPU_BACKENDS=torch:cuda,cup
 	@FDNT_XP_TEST_BACKENDS=$(GPU_BACKENDS) $(PYTEST)
 
 bench: $(VENV)/.dev ## the benchmarks
-	@$(PYTEST) benchmarks --benchmark-only
+	@$(PYTEST) benchmarks --benchmark-only --benchmark-timer=time.process_time \
+	  --benchmark-columns=min,median,rounds
 
 lint: $(VENV)/.dev ## style, types, import floors, devices
 	@$(BIN)/ruff check --quiet

@@ -57,6 +57,8 @@ from fdnt_xp.data.versions import KINDS, Population, Versions, draw_versions
 
 BATCH = 128
 """Galaxies that make one m; the scatter of m makes its error."""
+LEAST_M = 1e-6
+"""Where the axis of the figure begins; what is below lies there."""
 METACAL_BATCH, METACAL_STEP, METACAL_FWHM = 32, 0.01, 4.5
 """Of ngmix: a hundred times slower than the others; FWHM of the weight in pixels."""
 
@@ -290,9 +292,10 @@ def draw(rows: list[Row]):
         figure = new_figure(1.0 + 5.5 * len(snrs), 4.6)
         panels = figure.subplots(1, len(snrs), sharey=True, squeeze=False)[0]
         for panel, snr in zip(panels, snrs, strict=True):
-            panel.axhspan(0.0, TARGET, color=GREEN, alpha=0.10, lw=0, zorder=0)
-            for row in (row for row in rows if row.bias.snr == snr):
-                draw_code(panel, row)
+            panel.axhspan(LEAST_M, TARGET, color=GREEN, alpha=0.10, lw=0, zorder=0)
+            shown = [row for row in rows if row.bias.snr == snr]
+            for number, row in enumerate(shown):
+                draw_code(panel, row, above=number % 2 == 0)
             panel.axvline(1.0, color=PALE, lw=1.0)
             panel.set(
                 xscale="log",
@@ -300,19 +303,26 @@ def draw(rows: list[Row]):
                 title=f"S/N {snr:g}",
                 xlim=(0.8, 4.0 * max(row.timing.ratio for row in rows)),
             )
-            panel.set_yscale("symlog", linthresh=TARGET)
-            panel.set_ylim(0.0, None)
+            panel.set(yscale="log", ylim=(LEAST_M, 1.0))
         panels[0].set(ylabel="$|m|$   (open: negative)")
     return figure
 
 
-def draw_code(panel, row: Row) -> None:
+def draw_code(panel, row: Row, *, above: bool) -> None:
     colour = BLUE if row.ours else ORANGE
-    x, y = row.timing.ratio, abs(row.bias.m)
+    x, y, err = row.timing.ratio, abs(row.bias.m), row.bias.m_err
+    shown = min(max(y, 1.3 * LEAST_M), 0.8)
+    bars = [[min(err, shown - LEAST_M)], [err]]
     face = "white" if row.bias.m < 0 else colour
-    panel.errorbar(x, y, row.bias.m_err, fmt="o", ms=6, color=colour, mfc=face, capsize=2, lw=1.2)
+    panel.errorbar(x, shown, bars, fmt="o", ms=6, color=colour, mfc=face, capsize=2, lw=1.2)
     panel.annotate(
-        row.code, (x, y), xytext=(7, 5), textcoords="offset points", fontsize=8, color=INK
+        row.code,
+        (x, shown),
+        xytext=(0, 9 if above else -15),
+        textcoords="offset points",
+        ha="center",
+        fontsize=8,
+        color=INK,
     )
 
 
