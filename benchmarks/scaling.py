@@ -9,7 +9,7 @@ Stamps are float32: 128 galaxies again and again, each with noise of its own. Th
 memory, or with `--from-file` mapped from a temporary file, for where that does not hold them;
 file pages that the system keeps cached are not memory of the process. What is measured is the
 one call, from an array to arrays. `work` is the most memory that it holds at a time beyond its
-result, as NumPy counts its arrays; the result, 0.4 kB a galaxy, cannot but grow with n.
+result, as NumPy counts its arrays; the result, 0.1 kB a galaxy, cannot but grow with n.
 """
 
 from __future__ import annotations
