@@ -52,6 +52,8 @@ KINDS = {
     ),
     "sum, extreme, sort": ("sum", "amax", "amin", "max", "min", "all", "any", "sort", "mean"),
 }
+DEVICE_BANDWIDTH = 4.8e12
+"""Of an H200, by its data sheet, bytes per second."""
 SHOWN = 14
 """Functions of Python's profile."""
 REST = "arithmetic"
@@ -223,6 +225,8 @@ def lines(stamps: BenchStamps, *, markdown: bool) -> Iterator[str]:
         )
         yield table_row(cells, markdown=markdown)
     yield ""
+    yield device_line(whole.bytes / n_gal)
+    yield ""
     yield from table_head(("what the machine can do, one thread", ""), markdown=markdown)
     for name, rate in roofs().items():
         yield table_row((name, f"{rate:.3g}"), markdown=markdown)
@@ -233,6 +237,14 @@ def lines(stamps: BenchStamps, *, markdown: bool) -> Iterator[str]:
         yield table_row((f"`{name}`", f"{share:.1%}"), markdown=markdown)
     rest = sum(share for _, share in shares[SHOWN:])
     yield table_row((f"{len(shares) - SHOWN} others", f"{rest:.1%}"), markdown=markdown)
+
+
+def device_line(bytes_each: float) -> str:
+    rate = DEVICE_BANDWIDTH / bytes_each
+    return (
+        "Where each array goes through the memory of a device of "
+        f"{1e-12 * DEVICE_BANDWIDTH:g} TB/s, these bytes bound it to {int(float(f'{rate:.2g}')):,} galaxies/s; float32 halves them."
+    )
 
 
 def table_head(cells: tuple[str, ...], *, markdown: bool) -> Iterator[str]:

@@ -39,8 +39,8 @@ def tables(benchmarks: list[dict]) -> Iterator[str]:
     """Yield a table for each file of benchmarks."""
     for file in dict.fromkeys(one["fullname"].partition("::")[0] for one in benchmarks):
         here = [one for one in benchmarks if one["fullname"].startswith(file + "::")]
-        yield f"\n{Path(file).name}\n"
         yield from table(here)
+        yield ""
 
 
 def table(benchmarks: list[dict]) -> Iterator[str]:
@@ -60,6 +60,11 @@ def table(benchmarks: list[dict]) -> Iterator[str]:
             f"{per_galaxy(found[name]) / unit:.3g}" if name in found else "" for name in names
         ]
         yield f"| {group} | {' | '.join(ratios)} | {1e6 * unit:.2g} |"
+
+
+def in_units(one: dict, unit: float) -> str:
+    ratio = per_galaxy(one) / unit
+    return f"{ratio:.2g}" if ratio < 99.5 else f"{ratio:,.0f}"
 
 
 def per_galaxy(one: dict) -> float:

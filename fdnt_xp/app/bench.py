@@ -16,6 +16,8 @@ import fdnt_xp
 from fdnt_xp.app.backends import Backend, load_backend
 from fdnt_xp.app.bench_stamps import BenchStamps, make_stamps
 from fdnt_xp.app.numbers import check_json, write_json
+from fdnt_xp.app.prefetch import prepared_ahead
+from fdnt_xp.app.runner import CHUNK_ON_CPU, CHUNK_ON_GPU
 from fdnt_xp.app.timing import (
     Case,
     Clock,
@@ -132,10 +134,15 @@ def run_cases(options: BenchOptions) -> Bench:
 
 
 def make_cases(stamps: BenchStamps, backend: Backend, threads: int) -> tuple[Case, list[Case]]:
-    """Return the floor, and what is compared with it; all take arrays on the device."""
+    """Return the floor, and what is compared with it; nearly all take arrays on the device.
+
+    "From host memory" the stamps come in the chunks of `fdnt-xp measure`, of which the next is
+    copied while one is measured.
+    """
     pixels = backend.from_numpy(stamps.pixels)
     n_gal = len(stamps.pixels)
     few = min(n_gal, FEW)
+    chunk = CHUNK_ON_CPU if backend.on_cpu else CHUNK_ON_GPU
     psf = Psf.from_image(backend.from_numpy(stamps.star))
     stars = backend.from_numpy(np.broadcast_to(stamps.star, (few, *stamps.star.shape)))
     psfs = Psf.from_image(stars)
@@ -155,8 +162,17 @@ def make_cases(stamps: BenchStamps, backend: Backend, threads: int) -> tuple[Cas
 
         return Case(name="", n_gal=n_gal, run=run)
 
+    def from_host() -> float:
+        parts = [stamps.pixels[first : first + chunk] for first in range(0, n_gal, chunk)]
+        used = [
+            (len(part), _fraction(measure_shapes(part, psf, **noise).measured))
+            for part in prepared_ahead(parts, backend.upload)
+        ]
+        return sum(n * fraction for n, fraction in used) / n_gal
+
     named = {
         "measure_shapes": shapes(n_gal, psf),
+        "  from host memory": Case(name="", n_gal=n_gal, run=from_host),
         "  a PSF for each": shapes(few, psfs),
         "  transform=gl": shapes(few, psf, transform="gl"),
         "Psf.from_image for each": Case(
