@@ -33,7 +33,6 @@ from fdnt_xp.app.numbers import check_json, write_json
 from fdnt_xp.app.plots import (
     BLUE,
     GREEN,
-    INK,
     ORANGE,
     PALE,
     check_figure,
@@ -57,6 +56,8 @@ from fdnt_xp.data.versions import KINDS, Population, Versions, draw_versions
 
 BATCH = 128
 """Galaxies that make one m; the scatter of m makes its error."""
+MARKERS = "osDv^<>P"
+"""Of the codes in the figure, in their order."""
 LEAST_M = 1e-6
 """Where the axis of the figure begins; what is below lies there."""
 METACAL_BATCH, METACAL_STEP, METACAL_FWHM = 32, 0.01, 4.5
@@ -294,8 +295,8 @@ def draw(rows: list[Row]):
         for panel, snr in zip(panels, snrs, strict=True):
             panel.axhspan(LEAST_M, TARGET, color=GREEN, alpha=0.10, lw=0, zorder=0)
             shown = [row for row in rows if row.bias.snr == snr]
-            for number, row in enumerate(shown):
-                draw_code(panel, row, above=number % 2 == 0)
+            for marker, row in zip(MARKERS, shown, strict=False):
+                draw_code(panel, row, marker)
             panel.axvline(1.0, color=PALE, lw=1.0)
             panel.set(
                 xscale="log",
@@ -305,24 +306,27 @@ def draw(rows: list[Row]):
             )
             panel.set(yscale="log", ylim=(LEAST_M, 1.0))
         panels[0].set(ylabel="$|m|$   (open: negative)")
+        for marker, row in zip(MARKERS, shown, strict=False):
+            colour = BLUE if row.ours else ORANGE
+            panels[0].plot([], [], marker, ms=7, color=colour, label=row.code)
+        figure.legend(ncols=4, loc="outside lower center")
     return figure
 
 
-def draw_code(panel, row: Row, *, above: bool) -> None:
+def draw_code(panel, row: Row, marker: str) -> None:
     colour = BLUE if row.ours else ORANGE
-    x, y, err = row.timing.ratio, abs(row.bias.m), row.bias.m_err
-    shown = min(max(y, 1.3 * LEAST_M), 0.8)
-    bars = [[min(err, shown - LEAST_M)], [err]]
-    face = "white" if row.bias.m < 0 else colour
-    panel.errorbar(x, shown, bars, fmt="o", ms=6, color=colour, mfc=face, capsize=2, lw=1.2)
-    panel.annotate(
-        row.code,
-        (x, shown),
-        xytext=(0, 9 if above else -15),
-        textcoords="offset points",
-        ha="center",
-        fontsize=8,
-        color=INK,
+    m, err = abs(row.bias.m), row.bias.m_err
+    shown = min(max(m, 1.3 * LEAST_M), 0.8)
+    panel.errorbar(
+        row.timing.ratio,
+        shown,
+        [[min(err, shown - LEAST_M)], [err]],
+        fmt=marker,
+        ms=7,
+        color=colour,
+        mfc="white" if row.bias.m < 0 else colour,
+        capsize=2,
+        lw=1.2,
     )
 
 

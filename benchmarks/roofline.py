@@ -240,10 +240,11 @@ def lines(stamps: BenchStamps, *, markdown: bool) -> Iterator[str]:
 
 
 def device_line(bytes_each: float) -> str:
-    rate = DEVICE_BANDWIDTH / bytes_each
+    rate = int(float(f"{DEVICE_BANDWIDTH / bytes_each:.2g}"))
     return (
         "Where each array goes through the memory of a device of "
-        f"{1e-12 * DEVICE_BANDWIDTH:g} TB/s, these bytes bound it to {int(float(f'{rate:.2g}')):,} galaxies/s; float32 halves them."
+        f"{DEVICE_BANDWIDTH / 1e12:g} TB/s, "
+        f"these bytes bound it to {rate:,} galaxies/s; float32 halves them."
     )
 
 

@@ -56,9 +56,7 @@ def table(benchmarks: list[dict]) -> Iterator[str]:
         if floor is None:
             raise CatalogError(f"there is no FFT to compare with in the group {group!r}")
         unit = per_galaxy(floor)
-        ratios = [
-            f"{per_galaxy(found[name]) / unit:.3g}" if name in found else "" for name in names
-        ]
+        ratios = [in_units(found[name], unit) if name in found else "" for name in names]
         yield f"| {group} | {' | '.join(ratios)} | {1e6 * unit:.2g} |"
 
 
