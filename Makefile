@@ -39,8 +39,11 @@ test-jax: $(VENV)/.jax ## the kernels and the public functions on JAX
 test-gpu: $(VENV)/.dev ## the test suite on the GPU (GPU_BACKENDS=torch:cuda,cupy)
 	@FDNT_XP_TEST_BACKENDS=$(GPU_BACKENDS) $(PYTEST)
 
-bench: $(VENV)/.dev ## the benchmarks
-	@$(PYTEST) benchmarks --benchmark-only
+bench: $(VENV)/.dev ## the benchmarks, and tables of them in units of an FFT
+	@mkdir -p .benchmarks
+	@$(PYTEST) benchmarks --benchmark-only --benchmark-timer=time.process_time \
+	  --benchmark-columns=min,median,rounds --benchmark-json=.benchmarks/bench.json
+	@$(BIN)/python benchmarks/tables.py .benchmarks/bench.json
 
 lint: $(VENV)/.dev ## style, types, import floors, devices
 	@$(BIN)/ruff check --quiet

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from functools import lru_cache
 from types import ModuleType
 from typing import Any
 
@@ -13,21 +14,36 @@ import array_api_compat.numpy as compat_numpy
 import numpy as np
 import pytest
 
-from fdnt_xp.data.simulate import great08_image
+from fdnt_xp.app.backends import Backend, load_backend
+from fdnt_xp.app.bench_stamps import BenchStamps, make_stamps
 
 N_GAL, CELL = 1024, 48
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--cuda", action="store_true", help="also on torch's first CUDA device")
+    parser.addoption(
+        "--every-scene",
+        action="store_true",
+        help="all combinations of stamp size, batch and S/N, not one changed at a time",
+    )
+
+
+# Drawing takes longer than measuring, and one scene after the other is wanted.
+scene_of = lru_cache(maxsize=2)(make_stamps)
+"""Stamps by number, size and S/N."""
 
 
 @pytest.fixture(scope="session")
-def field() -> tuple[np.ndarray, np.ndarray]:
-    """Stamps (N_GAL, CELL, CELL) at S/N 200, and the star."""
-    drawn = great08_image(n_x=32, n_y=N_GAL // 32, cell=CELL, seed=3)
-    cells = drawn.image.reshape(N_GAL // 32, CELL, 32, CELL).transpose(0, 2, 1, 3)
-    return np.ascontiguousarray(cells).reshape(-1, CELL, CELL), drawn.psf_image
+def drawn() -> BenchStamps:
+    """N_GAL stamps of CELL x CELL pixels at S/N 200."""
+    return make_stamps(N_GAL, CELL)
+
+
+@pytest.fixture(scope="session")
+def field(drawn: BenchStamps) -> tuple[np.ndarray, np.ndarray]:
+    """The same, as stamps and star."""
+    return drawn.pixels, drawn.star
 
 
 class Library:
@@ -36,6 +52,10 @@ class Library:
     def __init__(self, name: str, dtype: str) -> None:
         self.name, self.dtype = name, dtype
         self.device = name.partition(":")[2]
+
+    @property
+    def backend(self) -> Backend:
+        return load_backend(self.name.partition(":")[0], self.device or None, self.dtype)
 
     @property
     def xp(self) -> ModuleType:

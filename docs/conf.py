@@ -20,7 +20,7 @@ extensions = [
     "sphinx.ext.mathjax",
     "generated_tables",
 ]
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "tables"]
 templates_path = ["_templates"]
 
 myst_enable_extensions = ["amsmath", "deflist", "dollarmath"]

@@ -33,6 +33,8 @@ class Backend:
         "float64" or "float32".
     from_numpy : callable
         Copies a NumPy array there, in this precision.
+    copy_beside : callable, optional
+        The same from another thread, while the device computes.
     """
 
     library: str
@@ -40,6 +42,12 @@ class Backend:
     device: str
     dtype: str
     from_numpy: Callable[[np.ndarray[Any, Any]], Array]
+    copy_beside: Callable[[np.ndarray[Any, Any]], Array] | None = None
+
+    @property
+    def upload(self) -> Callable[[np.ndarray[Any, Any]], Array]:
+        """What copies NumPy arrays there from a thread that runs ahead."""
+        return self.copy_beside or self.from_numpy
 
     @property
     def on_cpu(self) -> bool:
@@ -109,7 +117,27 @@ def _torch(device: str | None, dtype: str) -> Backend:
         from_numpy=lambda host: torch.asarray(
             host.astype(dtype), dtype=getattr(torch, dtype), device=place
         ),
+        copy_beside=_cuda_copies(place, dtype) if place.type == "cuda" else None,
     )
+
+
+def _cuda_copies(place: Any, dtype: str) -> Callable[[np.ndarray[Any, Any]], Array]:
+    """Return a copy to a CUDA device that does not queue behind the computations there."""
+    import torch
+
+    stream = torch.cuda.Stream(place)
+
+    def copy(host: np.ndarray[Any, Any]) -> Array:
+        # Only from pinned memory does a copy run beside the device's work.
+        pinned = torch.from_numpy(np.array(host, dtype=dtype, order="C")).pin_memory()
+        with torch.cuda.stream(stream):
+            there = pinned.to(place, non_blocking=True)
+        stream.synchronize()
+        # Its memory is that stream's, and must not be used again before these are done with it.
+        there.record_stream(torch.cuda.default_stream(place))
+        return there
+
+    return copy
 
 
 def _jax(device: str | None, dtype: str) -> Backend:

@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 import fdnt_xp
+from fdnt_xp.app.bench import BenchOptions, run_bench
 from fdnt_xp.app.check import CheckOptions, run_check
 from fdnt_xp.app.command import HOW, JOBS, OVERWRITE, WHERE, Command
 from fdnt_xp.app.demo import Field, run_demo
@@ -373,6 +374,35 @@ def check(output: str | None, figure: str | None, overwrite: bool, **options: An
             figure,
             overwrite=overwrite,
         )
+    for line in lines:
+        click.echo(line)
+
+
+@main.command(cls=Command)
+@WHERE
+@click.option(
+    "--threads", type=int, default=1, show_default=True, help="At most the cores there are."
+)
+@click.option("--n", type=int, metavar="N", help="Galaxies. [default: 1024, on a GPU 65536]")
+@click.option("--stamp-size", type=int, default=48, show_default=True, help="Pixels on a side.")
+@click.option("--snr", type=float, default=200.0, show_default=True, help="Signal to noise.")
+@click.option(
+    "--seconds",
+    type=float,
+    default=40.0,
+    show_default=True,
+    help="When to begin no further round; one there is.",
+)
+@click.option("--markdown", is_flag=True, help="Print the table as Markdown.")
+@click.option("-o", "--output", metavar="JSON", help="Numbers to write: .json.")
+@OVERWRITE
+def bench(output: str | None, markdown: bool, overwrite: bool, **options: Any) -> None:
+    """Time the measurements on this machine, in a minute.
+
+    Each is compared with one batched FFT of the same stamps, timed beside it in every round:
+    such a ratio does not depend on how busy the machine is.
+    """
+    lines = run_bench(BenchOptions(**options), output, markdown=markdown, overwrite=overwrite)
     for line in lines:
         click.echo(line)
 

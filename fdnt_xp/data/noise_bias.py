@@ -221,7 +221,7 @@ def noise_bias(
     ) as bar:
         for number in range(n_batches):
             seeds = [seed, versions.population.seed, number, round(1000 * snr)]
-            pair = _noisy_pair(versions, number, batch, sigma, seeds, power)
+            pair = noisy_pair(versions, number, batch, sigma, seeds, power)
             if observed_cut is not None:
                 pair = _cut_as_seen(pair, settings, observed_cut)
             for tally in tallies.values():
@@ -252,15 +252,28 @@ def coloured(white: NDArray[np.float64], power: NDArray[np.float64]) -> NDArray[
     return np.fft.ifft2(np.fft.fft2(white) * np.sqrt(power)).real
 
 
-def _noisy_pair(
+def noisy_pair(
     versions: Versions,
     number: int,
     batch: int,
     sigma: float,
     seed: list[int],
-    power: NDArray[np.float64] | None,
+    power: NDArray[np.float64] | None = None,
 ) -> tuple[NoisyStamps, NoisyStamps]:
-    """Return the stamps of a batch with shear +g, and those with -g."""
+    """Return the stamps of a batch with shear +g, and those with -g.
+
+    Parameters
+    ----------
+    versions : Versions
+    number, batch : int
+        Which batch; galaxies in it.
+    sigma : float
+        Of the noise of a pixel.
+    seed : list of int
+        Of the noise.
+    power : array, shape (ny, nx), optional
+        Its power spectrum, where it is not white.
+    """
     rng = np.random.default_rng(seed)
     names = number * batch + np.arange(batch)
     rows = names % versions.population.n_gal

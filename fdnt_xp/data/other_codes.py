@@ -6,7 +6,9 @@ Each takes noisy stamps and returns their shear; what it needs is imported when 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -114,20 +116,59 @@ def regauss_shear(stamps: NoisyStamps, psf_images: NDArray[np.float64]) -> Found
     ----------
     .. [1] Hirata & Seljak 2003, MNRAS 343, 459.
     """
-    galsim = load_galsim()
-    psfs = [galsim.Image(image) for image in psf_images]
-    shapes = []
-    for pixels, psf in zip(stamps.pixels, stamps.psf_of, strict=True):
-        image = galsim.Image(np.ascontiguousarray(pixels))
-        found = galsim.hsm.EstimateShear(image, psfs[psf], sky_var=stamps.variance, strict=False)
-        e1, e2 = found.corrected_e1, found.corrected_e2
-        if found.correction_status == 0 and math.hypot(e1, e2) < _LARGEST_E:
-            shapes.append((e1, e2))
-    e = np.reshape(shapes, (-1, 2))
+    e = np.reshape(
+        [
+            (shape.corrected_e1, shape.corrected_e2)
+            for shape in hsm_shapes(stamps, psf_images, "REGAUSS")
+            if shape.correction_status == 0
+            and math.hypot(shape.corrected_e1, shape.corrected_e2) < _LARGEST_E
+        ],
+        (-1, 2),
+    )
     return _ratio(e, np.full_like(e, 2.0 * (1.0 - stamps.e_rms**2)))
 
 
-def fpfs_shear(stamps: NoisyStamps, psf_images: NDArray[np.float64]) -> Found:
+def ksb_shear(stamps: NoisyStamps, psf_images: NDArray[np.float64]) -> Found:
+    """Return the mean of the shears of galaxies that KSB finds, `galsim.hsm.EstimateShear`.
+
+    Each is the estimate of a shear as it stands; those of 1 and more are left out. Parameters
+    and errors are those of `regauss_shear`.
+
+    References
+    ----------
+    .. [1] Kaiser, Squires & Broadhurst 1995, ApJ 449, 460.
+    """
+    g = np.reshape(
+        [
+            (shape.corrected_g1, shape.corrected_g2)
+            for shape in hsm_shapes(stamps, psf_images, "KSB")
+            if shape.correction_status == 0
+            and math.hypot(shape.corrected_g1, shape.corrected_g2) < 1.0
+        ],
+        (-1, 2),
+    )
+    return _ratio(g, np.ones_like(g))
+
+
+def hsm_shapes(stamps: NoisyStamps, psf_images: NDArray[np.float64], method: str) -> list[Any]:
+    """Return what `galsim.hsm.EstimateShear` says of each stamp, failures included."""
+    galsim = load_galsim()
+    psfs = [galsim.Image(image) for image in psf_images]
+    return [
+        galsim.hsm.EstimateShear(
+            galsim.Image(np.ascontiguousarray(pixels)),
+            psfs[psf],
+            sky_var=stamps.variance,
+            shear_est=method,
+            strict=False,
+        )
+        for pixels, psf in zip(stamps.pixels, stamps.psf_of, strict=True)
+    ]
+
+
+def fpfs_shear(
+    stamps: NoisyStamps, psf_images: NDArray[np.float64], *, renoise: bool = True
+) -> Found:
     """Return the mean ellipticity of AnaCal's FPFS over its mean linear response.
 
     `sigma_shapelets1` is `FPFS_SIZE`, `kmax_thres` 1e-12; the constant `c0` is the m00 of a
@@ -138,6 +179,8 @@ def fpfs_shear(stamps: NoisyStamps, psf_images: NDArray[np.float64]) -> Found:
     ----------
     stamps, psf_images
         As for `regauss_shear`; of one size.
+    renoise : bool
+        Without it nothing is added, and the noise bias stays.
 
     Raises
     ------
@@ -149,6 +192,21 @@ def fpfs_shear(stamps: NoisyStamps, psf_images: NDArray[np.float64]) -> Found:
     .. [1] Li & Mandelbaum 2023, MNRAS 521, 4904.
     .. [2] Li et al. 2025, MNRAS 536, 3663.
     """
+    values, responses = [], []
+    for measure in fpfs_calls(stamps, psf_images, renoise=renoise):
+        table = measure()
+        values += list(zip(table["fpfs1_e1"], table["fpfs1_e2"], strict=True))
+        responses += list(zip(table["fpfs1_de1_dg1"], table["fpfs1_de2_dg2"], strict=True))
+    return _ratio(np.array(values), np.array(responses))
+
+
+def fpfs_calls(
+    stamps: NoisyStamps, psf_images: NDArray[np.float64], *, renoise: bool = True
+) -> list[Callable[[], NDArray[Any]]]:
+    """Prepare the measurement by FPFS, one for each PSF; each returns a catalog of AnaCal's.
+
+    Parameters and errors are those of `fpfs_shear`.
+    """
     fpfs = load_anacal().fpfs
     size = stamps.pixels.shape[-1]
     flux = float(np.mean(np.sum(stamps.pixels, axis=(-2, -1))))
@@ -158,23 +216,24 @@ def fpfs_shear(stamps: NoisyStamps, psf_images: NDArray[np.float64]) -> Found:
         kmax_thres=1e-12,
         c0=flux / (2.0 * math.pi * FPFS_SIZE**2),
     )
-    more_noise = _more_noise(stamps)
-    values, responses = [], []
+    more_noise = _more_noise(stamps) if renoise else None
+    calls: list[Callable[[], NDArray[Any]]] = []
     for number in np.unique(stamps.psf_of):
         rows = np.flatnonzero(stamps.psf_of == number)
-        table = fpfs.process_image(
-            fpfs_config=config,
-            pixel_scale=1.0,
-            noise_variance=stamps.variance,
-            mag_zero=fpfs.THRESHOLD_REF_MAG_ZERO,
-            gal_array=_tiled(stamps.pixels[rows]),
-            psf_array=psf_images[number],
-            noise_array=_tiled(more_noise[rows]),
-            detection=_detection(stamps.offsets[rows], size),
+        calls.append(
+            partial(
+                fpfs.process_image,
+                fpfs_config=config,
+                pixel_scale=1.0,
+                noise_variance=stamps.variance,
+                mag_zero=fpfs.THRESHOLD_REF_MAG_ZERO,
+                gal_array=_tiled(stamps.pixels[rows]),
+                psf_array=psf_images[number],
+                noise_array=None if more_noise is None else _tiled(more_noise[rows]),
+                detection=_detection(stamps.offsets[rows], size),
+            )
         )
-        values += list(zip(table["fpfs1_e1"], table["fpfs1_e2"], strict=True))
-        responses += list(zip(table["fpfs1_de1_dg1"], table["fpfs1_de2_dg2"], strict=True))
-    return _ratio(np.array(values), np.array(responses))
+    return calls
 
 
 def turn_quarter(images: NDArray[np.float64]) -> NDArray[np.float64]:
