@@ -328,9 +328,7 @@ def shear_from_catalog(catalog: Table, weight: str, **options: Any) -> ShearEsti
 
 def _stack(sample: _Sample) -> ShearEstimate:
     stamps, psf = sample.stamps_and_psf()
-    # The challenge has galaxies of one S/N as seen: the brighter, the more the shear elongates
-    # them, which makes the stack of their fluxes 3 % too elongated.
-    return shear_from_stack(stamps, psf, normalise=True, chunk_size=sample.options.chunk)
+    return shear_from_stack(stamps, psf, chunk_size=sample.options.chunk)
 
 
 ESTIMATORS: Final[dict[str, Callable[[_Sample], ShearEstimate]]] = {
