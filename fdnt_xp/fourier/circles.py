@@ -7,9 +7,11 @@ edge costs 1e-4 in e. `|T|²` is evaluated by direct trigonometric sums, exact a
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from fdnt_xp.arrays import Array, array_namespace, device_of
+from fdnt_xp.arrays import Array, array_namespace, device_of, works_in_blocks
 from fdnt_xp.fourier.interpolation import CubicTable, cubic_table
 from fdnt_xp.fourier.jacobian import longest_stretch
 
@@ -18,9 +20,9 @@ _SCAN_RADII, _SCAN_ANGLES = 48, 12
 _TABLE_NODES, _TABLE_ANGLES = 97, 24
 """Nodes of the table of 𝒯. The mean over the angle need not be exact: any isotropic weight
 gives a valid null test. It must be smooth in k, which it is for any number of angles."""
-CIRCLES, CIRCLE_POINTS = 25, 24
-"""Of the table of `|T|²` on circles, and points on half of each."""
-_PSFS_AT_ONCE = 64
+CIRCLES, CIRCLE_POINTS = 25, _TABLE_ANGLES
+"""Of the table of `|T|²` on circles, every fourth of those, and points on half of each."""
+_PSFS_AT_ONCE, _PSFS_IN_CACHE = 64, 8
 """Bounds the memory of the trigonometric sums."""
 
 
@@ -39,8 +41,9 @@ def circle_tables(
     xp = array_namespace(image=image)
     n_psf = int(image.shape[0])
     parts = []
-    for start in range(0, max(n_psf, 1), _PSFS_AT_ONCE):
-        rows = slice(start, min(start + _PSFS_AT_ONCE, n_psf))
+    at_once = _PSFS_IN_CACHE if works_in_blocks(image) else _PSFS_AT_ONCE
+    for start in range(0, max(n_psf, 1), at_once):
+        rows = slice(start, min(start + at_once, n_psf))
         some = None if unit is None else unit[rows, :, :]
         parts.append(_circularise(image[rows, :, :], oversampling, floor, some))
     kmax, power, ln_power = (xp.concat(part) for part in zip(*parts, strict=True))
@@ -75,22 +78,19 @@ def _circularise(
     if unit is not None:
         # A circle of the sky is an ellipse on the grid, and must not reach out of that.
         scan = scan / longest_stretch(unit)[:, None]
-    kmax = _first_crossing(scan, _mean_power(image, scan, _SCAN_ANGLES, oversampling, unit), floor)
+    scanned = power_on_circles(image, scan, _SCAN_ANGLES, oversampling, unit)
+    kmax = _first_crossing(scan, _mean(scanned), floor)
     t = xp.linspace(0.0, 1.0, _TABLE_NODES, **like)[None, :]
-    power = _mean_power(image, kmax[:, None] * t, _TABLE_ANGLES, oversampling, unit)
-    circles = xp.linspace(0.0, 1.0, CIRCLES, **like)[None, :]
-    on_circles = power_on_circles(image, kmax[:, None] * circles, CIRCLE_POINTS, oversampling, unit)
+    every = power_on_circles(image, kmax[:, None] * t, _TABLE_ANGLES, oversampling, unit)
+    power, on_circles = _mean(every), every[:, :: (_TABLE_NODES - 1) // (CIRCLES - 1), :]
     # Where a PSF is dark there is no logarithm; the weight ends before.
     least = xp.full_like(on_circles, float(xp.finfo(image.dtype).smallest_normal))
     return kmax, _ended_smoothly(power, t), xp.log(xp.maximum(on_circles, least))
 
 
-def _mean_power(
-    image: Array, radii: Array, n_angle: int, oversampling: float, unit: Array | None
-) -> Array:
-    """Return `<|T|^-2>_θ^-1` on circles, shape (n_psf, n_radius)."""
-    xp = array_namespace(image=image)
-    power = power_on_circles(image, radii, n_angle, oversampling, unit)
+def _mean(power: Array) -> Array:
+    """Return `<|T|^-2>_θ^-1`, shape (n_psf, n_radius), of `|T|²` on circles."""
+    xp = array_namespace(power=power)
     dark = xp.any(power <= 0, axis=-1)
     inverse = xp.mean(1.0 / xp.where(power > 0, power, xp.ones_like(power)), axis=-1)
     return xp.where(dark, xp.zeros_like(inverse), 1.0 / inverse)
@@ -122,20 +122,38 @@ def power_on_circles(
     like = {"dtype": image.dtype, "device": device_of(image)}
     cos, sin = (xp.asarray(f(angle), **like) for f in (np.cos, np.sin))
     n_radius = int(radii.shape[1])
-    points = (int(radii.shape[0]), n_radius * n_angle, 1)
+    points = (int(radii.shape[0]), n_radius * n_angle)
     kx = xp.reshape(radii[:, :, None] * cos, points)
     ky = xp.reshape(radii[:, :, None] * sin, points)
     if unit is not None:
-        kx, ky = (unit[:, 0:1, j : j + 1] * kx + unit[:, 1:2, j : j + 1] * ky for j in (0, 1))
-    phase_x = kx * (pixels_from_middle(nx, image) / oversampling)
-    phase_y = ky * (pixels_from_middle(ny, image) / oversampling)
-    cos_y, sin_y = xp.cos(phase_y), xp.sin(phase_y)
-    rows = xp.matrix_transpose(image)
-    cos_sum = xp.matmul(xp.cos(phase_x), rows)
-    sin_sum = xp.matmul(xp.sin(phase_x), rows)
-    re = xp.sum(cos_sum * cos_y - sin_sum * sin_y, axis=-1)
-    im = xp.sum(cos_sum * sin_y + sin_sum * cos_y, axis=-1)
+        kx, ky = (unit[:, 0, j : j + 1] * kx + unit[:, 1, j : j + 1] * ky for j in (0, 1))
+    cos_x, sin_x = _waves_at(kx, nx, oversampling)
+    cos_y, sin_y = _waves_at(ky, ny, oversampling)
+    cos_sum, sin_sum = xp.matmul(image, cos_x), xp.matmul(image, sin_x)
+    re = xp.sum(cos_sum * cos_y - sin_sum * sin_y, axis=1)
+    im = xp.sum(cos_sum * sin_y + sin_sum * cos_y, axis=1)
     return xp.reshape(re**2 + im**2, (-1, n_radius, n_angle))
+
+
+def _waves_at(k: Array, n: int, oversampling: float) -> tuple[Array, Array]:
+    """Return `cos k x` and `sin k x` of n pixels, shape (n_psf, n, n_point).
+
+    A wave over all pixels is the product of one over blocks of them and one over the pixels of
+    a block: about `2 sqrt(n)` cosines instead of n.
+    """
+    xp = array_namespace(k=k)
+    n_block = math.isqrt(n)
+    n_pixel = -(-n // n_block)
+    like = {"dtype": k.dtype, "device": device_of(k)}
+    first = (xp.arange(n_block, **like) * n_pixel - 0.5 * (n - 1)) / oversampling
+    block = k[:, None, :] * first[None, :, None]
+    pixel = k[:, None, :] * (xp.arange(n_pixel, **like) / oversampling)[None, :, None]
+    cos_b, sin_b = (f(block)[:, :, None, :] for f in (xp.cos, xp.sin))
+    cos_p, sin_p = (f(pixel)[:, None, :, :] for f in (xp.cos, xp.sin))
+    shape = (int(k.shape[0]), n_block * n_pixel, int(k.shape[1]))
+    cos = xp.reshape(cos_b * cos_p - sin_b * sin_p, shape)
+    sin = xp.reshape(sin_b * cos_p + cos_b * sin_p, shape)
+    return cos[:, :n, :], sin[:, :n, :]
 
 
 def _first_crossing(radii: Array, power: Array, floor: float) -> Array:

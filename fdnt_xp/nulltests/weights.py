@@ -29,7 +29,9 @@ from fdnt_xp.nulltests.forms import seen_through
 _QUADRATURE: Final = 96
 """Gauss-Legendre nodes of the integrals over k in the size equation."""
 _WIDTH_NODES: Final = 129
-_NEWTON_STEPS: Final = 8
+_NODES: Final = 257
+"""Of the table that is inverted."""
+_NEWTON_STEPS: Final = 4
 """1/<k²> is nearly linear in sigma² (exactly so for a Gaussian 𝒯): Newton needs few steps."""
 _LEAST_SQUARE: Final = 1e-30
 """Of k, (rad/pixel)²: far below that of any mode but k = 0, and no trouble to divide by."""
@@ -73,7 +75,8 @@ class Weight:
     Parameters
     ----------
     psf_part : CubicTable
-        `𝒯` as a function of `k/kmax`.
+        `𝒯` as a function of `k/kmax`. (Not of its square, which would take no root: many are
+        not smooth in k² at 0, and a table of that costs accuracy.)
     kmax : array, shape (n_psf,)
         Where `𝒯` ends, rad/pixel.
     widths : WidthTable, optional
@@ -124,9 +127,12 @@ class Weight:
         xp = array_namespace(square=square)
         scale = (shrink / self.kmax)[:, None]
         # At k = 0 the derivative only ever meets factors of q: any finite number will do.
-        t = xp.sqrt(xp.maximum(square, xp.full_like(scale, _LEAST_SQUARE))) * scale
+        t = xp.sqrt(xp.abs(square) + _LEAST_SQUARE)
+        t *= scale
         value, slope = self.psf_part.evaluate(t, self._rows(int(square.shape[0])))
-        return value, slope / t * (0.5 * scale**2)
+        slope /= t
+        slope *= 0.5 * scale**2
+        return value, slope
 
     def round_window(self, grid: KGrid, size: float, shrink: Array | None = None) -> Array:
         """Return the weight of a round galaxy on the modes of a grid, shape (n_psf, n_k).
@@ -219,26 +225,46 @@ def _width_table(psf: Psf, largest_size: float) -> WidthTable:
     narrow = xp.full_like(psf.kmax, _NARROWEST**2)
     wide = xp.maximum((largest_size * psf.kmax) ** 2, 4.0 * narrow)
     ends = xp.stack([narrow, wide], axis=-1)
-    square_ends, _ = _inverse_mean_square(measure, t, ends)
+    by_width = _SquareTable.of(measure, t, wide)
+    square_ends, _ = by_width.inverse_mean_square(ends, row)
     fraction = xp.linspace(0.0, 1.0, _WIDTH_NODES, **like)[None, :]
     low, high = square_ends[:, 0:1], square_ends[:, 1:2]
     wanted = low + fraction * (high - low)
     width = ends[:, 0:1] + fraction * (ends[:, 1:2] - ends[:, 0:1])
     for _ in range(_NEWTON_STEPS):
-        square, slope = _inverse_mean_square(measure, t, width)
-        width = xp.maximum(width + (wanted - square) / slope, xp.zeros_like(width))
+        square, slope = by_width.inverse_mean_square(width, row)
+        width = xp.maximum(width + (wanted - square) / slope, ends[:, 0:1])
     relative = (width - ends[:, 0:1]) / (ends[:, 1:2] - ends[:, 0:1])
     return WidthTable(part=cubic_table(relative), width_range=ends, square_range=square_ends)
 
 
-def _inverse_mean_square(measure: Array, t: Array, width: Array) -> tuple[Array, Array]:
-    """Return `1/<t²>` under `𝒯(t) exp(-t² width/2) t dt` and its derivative by the width.
+@dataclass(frozen=True, kw_only=True)
+class _SquareTable:
+    """`1/<t²>` under `𝒯(t) exp(-t² width/2) t dt` for each PSF, as a function of the width.
 
-    `measure` (n_psf, n_t) holds `𝒯 t dt`; `width` and the results are (n_psf, n_width).
+    The widths at its nodes are the same for all PSFs: so are the exponentials, and the
+    integrals are a matrix product.
     """
-    xp = array_namespace(t=t)
-    square = t**2
-    gauss = measure[:, None, :] * xp.exp(-0.5 * width[:, :, None] * square)
-    m0, m2, m4 = (xp.sum(gauss * f, axis=-1) for f in (xp.ones_like(square), square, square**2))
-    # d<t²>/dwidth = -Var(t²)/2.
-    return m0 / m2, 0.5 * (m4 * m0 - m2**2) / m2**2
+
+    part: CubicTable
+    widest: Array
+
+    @classmethod
+    def of(cls, measure: Array, t: Array, wide: Array) -> _SquareTable:
+        """Tabulate up to the largest of the widths; `measure` (n_psf, n_t) holds `𝒯 t dt`."""
+        xp = array_namespace(t=t)
+        like = {"dtype": t.dtype, "device": device_of(t)}
+        # Beyond its end a table has no slope.
+        least = xp.full((1,), 4.0 * _NARROWEST**2, **like)
+        widest = 1.001 * xp.max(xp.concat([wide, least]))
+        width = _NARROWEST**2 + (widest - _NARROWEST**2) * xp.linspace(0.0, 1.0, _NODES, **like)
+        square = t**2
+        gauss = xp.exp(square[:, None] * (-0.5 * width)[None, :])
+        part = xp.matmul(measure, gauss) / xp.matmul(measure * square, gauss)
+        return cls(part=cubic_table(part), widest=widest)
+
+    def inverse_mean_square(self, width: Array, row: Array) -> tuple[Array, Array]:
+        """Return `1/<t²>` and its derivative by the width, shape (n_psf, n_width)."""
+        span = self.widest - _NARROWEST**2
+        value, slope = self.part.evaluate((width - _NARROWEST**2) / span, row)
+        return value, slope / span
