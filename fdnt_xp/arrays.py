@@ -24,6 +24,11 @@ DType: TypeAlias = Any
 
 _NUMBERS_IN_CACHE: Final = 2**16
 """Of an array that is used again before it is pushed out, together with a few others."""
+_CALLS_COST: Final = 4
+"""How much larger blocks are where a call takes longer than one of NumPy's."""
+
+_FEW_ROWS: Final = 4
+"""Of a block where the work on one fills the cache."""
 
 _NAMESPACES: Final[dict[type, ModuleType]] = {}
 
@@ -117,13 +122,17 @@ def works_in_blocks(array: Array) -> bool:
     return on_cpu and not compiles_every_shape(array_namespace(array=array))
 
 
-def blocks_in_cache(array: Array) -> list[slice]:
+def blocks_in_cache(array: Array, more: int = 1) -> list[slice]:
     """Return ranges of the rows of an (n, m) array to be worked at one at a time.
 
-    There is always one, be it empty.
+    There is always one, be it empty. With `more` the work on a row needs so many times its
+    length: blocks then have at least a few rows, which share what a call costs.
     """
     n, m = (int(length) for length in array.shape)
-    rows = max(1, _NUMBERS_IN_CACHE // max(m, 1)) if works_in_blocks(array) else max(n, 1)
+    least = 1 if more == 1 else _FEW_ROWS
+    numbers = _NUMBERS_IN_CACHE * (1 if isinstance(array, np.ndarray) else _CALLS_COST)
+    rows = max(least, numbers // max(m * more, 1))
+    rows = rows if works_in_blocks(array) else max(n, 1)
     return [slice(first, min(first + rows, n)) for first in range(0, max(n, 1), rows)]
 
 

@@ -39,7 +39,10 @@ class DeconvolvedStamps:
         xp = array_namespace(re=self.re)
         phase = mode_phase(grid, grid.on_stamp(centroid))
         cos, sin = xp.real(phase), xp.imag(phase)
-        return cos * self.re - sin * self.im, sin * self.re + cos * self.im
+        re, im = cos * self.re, sin * self.re
+        re -= sin * self.im
+        im += cos * self.im
+        return re, im
 
 
 def deconvolve(stamps: Array, inverse_transfer: Array, grid: KGrid) -> DeconvolvedStamps:
@@ -102,7 +105,9 @@ def mode_phase(grid: KGrid, position: Array) -> Array:
     along_x = xp.exp(complex_like(position[:, 0:1] * kx) * 1j)
     along_y = xp.exp(complex_like(position[:, 1:2] * ky) * 1j)
     row, column = grid.row_and_column
-    return xp.take(along_y, row, axis=1) * xp.take(along_x, column, axis=1)
+    phase = xp.take(along_y, row, axis=1)
+    phase *= xp.take(along_x, column, axis=1)
+    return phase
 
 
 def complex_like(array: Array) -> Array:

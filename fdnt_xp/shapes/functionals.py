@@ -9,7 +9,7 @@ functions; the covariance follows from theirs, be it as uneven as it likes (docs
 
 from __future__ import annotations
 
-from fdnt_xp.arrays import Array, array_namespace, device_of
+from fdnt_xp.arrays import Array, array_namespace, blocks_in_cache, device_of
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.noise import PixelNoise
 from fdnt_xp.fourier.transform import complex_like, mode_phase
@@ -141,9 +141,15 @@ def on_coefficients(h: Array, basis: LaguerreBasis, grid: KGrid) -> Array:
         Of the fits to it.
     """
     xp = array_namespace(h=h)
-    h = xp.conj(xp.conj(h) * mode_phase(grid, basis.centroid)[:, None, :])
-    functions = xp.matrix_transpose(basis.in_k(grid.kx, grid.ky))
-    re, im = xp.matmul(xp.real(h), functions), xp.matmul(xp.imag(h), functions)
+    parts = []
+    # A few galaxies at a time: their functions then stay in the cache.
+    for rows in blocks_in_cache(h[:, 0, :], basis.n_coef):
+        some = basis.take(rows)
+        shifted = xp.conj(xp.conj(h[rows, :, :]) * mode_phase(grid, some.centroid)[:, None, :])
+        functions = xp.matrix_transpose(some.in_k(grid.kx, grid.ky))
+        pair = (xp.real(shifted), xp.imag(shifted))
+        parts.append([xp.matmul(part, functions) for part in pair])
+    re, im = (xp.concat(list(part), axis=0) for part in zip(*parts, strict=True))
     # Re[h (-i)^n phi] is Re h, Im h, -Re h, -Im h times phi.
     signs = [(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)]
     like = {"dtype": re.dtype, "device": device_of(re)}

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fdnt_xp.arrays import Array, array_namespace, device_of
+from fdnt_xp.arrays import Array, array_namespace, blocks_in_cache, device_of
 from fdnt_xp.nulltests.dogleg import DoglegOptions, RootResult, find_root
 from fdnt_xp.nulltests.scaled import inverse_if_positive
 from fdnt_xp.shapes.laguerre import LaguerreBasis, generators, pixel_positions, position
@@ -136,12 +136,16 @@ def starting_moments(stamps: Array, ivar: Array) -> tuple[Array, Array]:
 
 
 def fit_pixels(basis: LaguerreBasis, stamps: Array, ivar: Array) -> LinearFit:
-    """Fit the functions of the bases to the pixels."""
+    """Fit the functions of the bases to the pixels, a few galaxies at a time."""
     xp = array_namespace(stamps=stamps)
     n_gal, ny, nx = stamps.shape
-    functions = basis.in_x(*pixel_positions(xp, stamps))
-    flat = (n_gal, ny * nx)
-    return least_squares(functions, xp.reshape(stamps, flat), xp.reshape(ivar, flat))
+    x, y = pixel_positions(xp, stamps)
+    stamps, ivar = (xp.reshape(pixels, (n_gal, ny * nx)) for pixels in (stamps, ivar))
+    fits = [
+        least_squares(basis.take(rows).in_x(x, y), stamps[rows, :], ivar[rows, :])
+        for rows in blocks_in_cache(stamps, basis.n_coef)
+    ]
+    return LinearFit.concat(fits)
 
 
 def basis_at(x: Array, like: LaguerreBasis) -> LaguerreBasis:

@@ -32,7 +32,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fdnt_xp.arrays import Array, array_namespace, device_of
+from fdnt_xp.arrays import Array, Rows, array_namespace, device_of, rows_of
 from fdnt_xp.errors import FdntTypeError, RangeError
 from fdnt_xp.shear import hyperbolic_series, hyperbolic_slopes, shear_matrix
 
@@ -108,14 +108,13 @@ class LaguerreBasis:
         """Number of functions."""
         return n_coefficients(self.order)
 
-    def take(self, rows: Array) -> LaguerreBasis:
-        """Return the bases of the given galaxies (integer array)."""
-        xp = array_namespace(eta=self.eta, rows=rows)
+    def take(self, rows: Rows) -> LaguerreBasis:
+        """Return the bases of the given galaxies."""
         return LaguerreBasis(
             order=self.order,
-            eta=xp.take(self.eta, rows, axis=0),
-            centroid=xp.take(self.centroid, rows, axis=0),
-            size=xp.take(self.size, rows, axis=0),
+            eta=rows_of(self.eta, rows),
+            centroid=rows_of(self.centroid, rows),
+            size=rows_of(self.size, rows),
         )
 
     def in_x(self, x: Array, y: Array) -> Array:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from typing import Final
 
 from fdnt_xp.arrays import Array, array_namespace, device_of
@@ -40,6 +41,15 @@ class LinearFit:
     covariance: Array
     inflation: Array
     n_pixels: Array
+
+    @classmethod
+    def concat(cls, parts: Sequence[LinearFit]) -> LinearFit:
+        """Join fits, at least one, in the order given."""
+        if len(parts) == 1:
+            return parts[0]
+        xp = array_namespace(inflation=parts[0].inflation)
+        names = [field.name for field in fields(cls)]
+        return cls(**{n: xp.concat([getattr(part, n) for part in parts], axis=0) for n in names})
 
 
 def least_squares(functions: Array, pixels: Array, ivar: Array) -> LinearFit:
