@@ -53,7 +53,8 @@ def stamps(dtype, to_xp):
 @pytest.fixture(params=[1, 1000], ids=["together", "one by one"])
 def psfs(request, monkeypatch, stars, to_xp):
     """The PSFs by index, and one for each galaxy; those that share one in work together or not."""
-    monkeypatch.setattr(job_module, "_FEWEST_ON_A_PSF", request.param)
+    for fewest in ("_FEWEST_ON_A_PSF", "_FEWEST_TO_MEASURE"):
+        monkeypatch.setattr(job_module, fewest, request.param)
     shared = fx.Psf.from_image(stars, psf_index=to_xp(INDEX))
     assert (shared.n_psf, shared.n_gal) == (3, N_GAL)
     return shared, fx.Psf.from_image(stars).with_index(to_xp(INDEX)).take(to_xp(np.arange(N_GAL)))
@@ -107,7 +108,8 @@ def test_masks_follow_their_galaxies(psfs, stamps, dtype, to_xp, to_np):
 
 
 def test_a_bad_star_costs_its_own_galaxies(stars, stamps, dtype, to_xp, to_np, monkeypatch):
-    monkeypatch.setattr(job_module, "_FEWEST_ON_A_PSF", 1)
+    for fewest in ("_FEWEST_ON_A_PSF", "_FEWEST_TO_MEASURE"):
+        monkeypatch.setattr(job_module, fewest, 1)
     images = to_np(stars).copy()
     images[1] = 0.0
     psf = fx.Psf.from_image(to_xp(images, dtype), psf_index=to_xp(INDEX))
@@ -117,14 +119,16 @@ def test_a_bad_star_costs_its_own_galaxies(stars, stamps, dtype, to_xp, to_np, m
 
 
 def test_a_star_that_no_galaxy_has(stars, stamps, to_xp, to_np, monkeypatch):
-    monkeypatch.setattr(job_module, "_FEWEST_ON_A_PSF", 1)
+    for fewest in ("_FEWEST_ON_A_PSF", "_FEWEST_TO_MEASURE"):
+        monkeypatch.setattr(job_module, fewest, 1)
     index = np.where(INDEX == 1, 0, INDEX)
     shapes = fx.measure_shapes(stamps, fx.Psf.from_image(stars, psf_index=to_xp(index)))
     assert to_np(shapes.measured).all()
 
 
 def test_the_control_of_noise_bias(monkeypatch):
-    monkeypatch.setattr(job_module, "_FEWEST_ON_A_PSF", 1)
+    for fewest in ("_FEWEST_ON_A_PSF", "_FEWEST_TO_MEASURE"):
+        monkeypatch.setattr(job_module, fewest, 1)
     images = np.stack([gaussian_image(c, (SIDE, SIDE)) for c in psf_covariances()])
     clean = np.stack([gaussian_image(3.0 * c, (SIDE, SIDE)) for c in psf_covariances()])[INDEX]
     psf = fx.Psf.from_image(images, psf_index=INDEX)

@@ -33,6 +33,8 @@ _FEWEST_CELLS: Final = 3.0
 """Least radius of the disc, in cells of the k grid: quadrupoles need an annulus or two."""
 _FEWEST_ON_A_PSF: Final = 32
 """Galaxies for each PSF, in the mean, from which those that share one are taken together."""
+_FEWEST_TO_MEASURE: Final = 1024
+"""The same where each chunk ends with a search for its slowest few: see `Job.chunks`."""
 _BYTES_AT_ONCE: Final = 128e6
 """Memory of a chunk of galaxies."""
 _FIELDS: Final = 24
@@ -84,13 +86,15 @@ class Job:
     size: Array | None
     max_iter: int
 
-    def chunks(self, n_gal: int, n_chunk: int) -> list[Chunk]:
+    def chunks(self, n_gal: int, n_chunk: int, *, searched: bool = False) -> list[Chunk]:
         """Return all galaxies in parts of at most `n_chunk`: by their PSF if many share one.
 
-        An empty sample still has its one chunk, of no rows.
+        An empty sample still has its one chunk, of no rows. Where a root is `searched` for each
+        galaxy, the last few of a chunk take as long as hundreds do together.
         """
         index = self.psf.index
-        few = n_gal == 0 or n_gal < _FEWEST_ON_A_PSF * self.psf.n_psf
+        fewest = _FEWEST_TO_MEASURE if searched else _FEWEST_ON_A_PSF
+        few = n_gal == 0 or n_gal < fewest * self.psf.n_psf
         if index is None or self.weight.shared or few:
             firsts = range(0, max(n_gal, 1), n_chunk)
             return [Chunk(rows=slice(first, min(first + n_chunk, n_gal))) for first in firsts]

@@ -166,7 +166,7 @@ def measure_shapes(
     fixed = _fixed_size(xp, stamps, size, sky)
     job = prepare(xp, stamps, seen, padding=padding, size=fixed, max_iter=max_iter)
     n_chunk = chunk_size or galaxies_in_memory(job, pixels, transform, order)
-    chunks = job.chunks(n_gal, n_chunk)
+    chunks = job.chunks(n_gal, n_chunk, searched=True)
     result = ShapeResult.concat(
         [_measure_chunk(job.of(part), pixels.take(part.rows), transform, order) for part in chunks]
     )
