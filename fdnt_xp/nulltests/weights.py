@@ -15,6 +15,7 @@ is inverted once, in a table.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -225,7 +226,7 @@ def _width_table(psf: Psf, largest_size: float) -> WidthTable:
     narrow = xp.full_like(psf.kmax, _NARROWEST**2)
     wide = xp.maximum((largest_size * psf.kmax) ** 2, 4.0 * narrow)
     ends = xp.stack([narrow, wide], axis=-1)
-    by_width = _SquareTable.of(measure, t, wide)
+    by_width = _SquareTable.of(measure, t, largest_size)
     square_ends, _ = by_width.inverse_mean_square(ends, row)
     fraction = xp.linspace(0.0, 1.0, _WIDTH_NODES, **like)[None, :]
     low, high = square_ends[:, 0:1], square_ends[:, 1:2]
@@ -242,29 +243,28 @@ def _width_table(psf: Psf, largest_size: float) -> WidthTable:
 class _SquareTable:
     """`1/<t²>` under `𝒯(t) exp(-t² width/2) t dt` for each PSF, as a function of the width.
 
-    The widths at its nodes are the same for all PSFs: so are the exponentials, and the
-    integrals are a matrix product.
+    The nodes, equidistant in the root of the width, are the same for all PSFs there may be: so
+    are the exponentials, and the integrals are a matrix product.
     """
 
     part: CubicTable
-    widest: Array
+    widest: float
 
     @classmethod
-    def of(cls, measure: Array, t: Array, wide: Array) -> _SquareTable:
-        """Tabulate up to the largest of the widths; `measure` (n_psf, n_t) holds `𝒯 t dt`."""
+    def of(cls, measure: Array, t: Array, largest_size: float) -> _SquareTable:
+        """Tabulate up to the largest size, pixels; `measure` (n_psf, n_t) holds `𝒯 t dt`."""
         xp = array_namespace(t=t)
-        like = {"dtype": t.dtype, "device": device_of(t)}
-        # Beyond its end a table has no slope.
-        least = xp.full((1,), 4.0 * _NARROWEST**2, **like)
-        widest = 1.001 * xp.max(xp.concat([wide, least]))
-        width = _NARROWEST**2 + (widest - _NARROWEST**2) * xp.linspace(0.0, 1.0, _NODES, **like)
+        # No kmax is above pi. Beyond its end a table has no slope.
+        widest = 1.01 * max(largest_size * math.pi, 2.0 * _NARROWEST)
+        root = xp.linspace(_NARROWEST, widest, _NODES, dtype=t.dtype, device=device_of(t))
         square = t**2
-        gauss = xp.exp(square[:, None] * (-0.5 * width)[None, :])
+        gauss = xp.exp(square[:, None] * (-0.5 * root**2)[None, :])
         part = xp.matmul(measure, gauss) / xp.matmul(measure * square, gauss)
         return cls(part=cubic_table(part), widest=widest)
 
     def inverse_mean_square(self, width: Array, row: Array) -> tuple[Array, Array]:
         """Return `1/<t²>` and its derivative by the width, shape (n_psf, n_width)."""
-        span = self.widest - _NARROWEST**2
-        value, slope = self.part.evaluate((width - _NARROWEST**2) / span, row)
-        return value, slope / span
+        xp = array_namespace(width=width)
+        span, root = self.widest - _NARROWEST, xp.sqrt(width)
+        value, slope = self.part.evaluate((root - _NARROWEST) / span, row)
+        return value, slope / (2.0 * span * root)
