@@ -21,7 +21,8 @@ from dataclasses import dataclass, replace
 
 from fdnt_xp.arrays import Array, array_namespace, device_of
 from fdnt_xp.nulltests.scaled import scaled_tests
-from fdnt_xp.nulltests.tests import MatchedWidth, NullTests, TestValues
+from fdnt_xp.nulltests.tests import NullTests
+from fdnt_xp.nulltests.values import MatchedWidth, TestValues
 
 
 @dataclass(frozen=True, kw_only=True)

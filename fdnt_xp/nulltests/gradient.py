@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from fdnt_xp.arrays import Array, array_namespace, device_of
 from fdnt_xp.nulltests.dogleg import newton_step
-from fdnt_xp.nulltests.tests import MatchedWidth, TestValues
+from fdnt_xp.nulltests.values import MatchedWidth, TestValues
 
 
 def ellipticity_gradient(

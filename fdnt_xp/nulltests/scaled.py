@@ -6,12 +6,8 @@ neither flux nor units. It may be of one galaxy, or of the sums over its exposur
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from fdnt_xp.arrays import Array, array_namespace
-
-if TYPE_CHECKING:
-    from fdnt_xp.nulltests.tests import MatchedWidth, TestValues
+from fdnt_xp.nulltests.values import MatchedWidth, TestValues
 
 
 def scaled_tests(

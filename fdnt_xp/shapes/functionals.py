@@ -14,7 +14,8 @@ from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.noise import PixelNoise
 from fdnt_xp.fourier.transform import complex_like, mode_phase
 from fdnt_xp.nulltests.forms import sheared_forms
-from fdnt_xp.nulltests.tests import NullTests, TestNoise
+from fdnt_xp.nulltests.tests import NullTests
+from fdnt_xp.nulltests.values import TestNoise
 from fdnt_xp.shapes.laguerre import LaguerreBasis, degrees
 
 N_FUNCTIONALS = 5

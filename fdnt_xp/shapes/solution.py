@@ -10,7 +10,8 @@ from fdnt_xp.arrays import Array, array_namespace, device_of, has_any
 from fdnt_xp.flags import FAILED, Flag
 from fdnt_xp.nulltests.dogleg import RootResult, Status, newton_step
 from fdnt_xp.nulltests.gradient import ellipticity_gradient
-from fdnt_xp.nulltests.tests import MatchedWidth, NullTests, TestNoise, TestValues
+from fdnt_xp.nulltests.tests import NullTests
+from fdnt_xp.nulltests.values import MatchedWidth, TestNoise, TestValues
 from fdnt_xp.shapes.results import ShapeResult
 
 _MOST_ELLIPTICAL: Final = 4.0
