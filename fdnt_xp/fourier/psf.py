@@ -340,7 +340,8 @@ def transform_on_modes(image: Array, grid: KGrid, oversampling: float) -> Array:
     """
     xp = array_namespace(image=image)
     n_psf, ny, nx = (int(n) for n in image.shape)
-    if oversampling == 1.0 and ny <= grid.shape[0] and nx <= grid.shape[1]:
+    fits = oversampling == 1.0 and ny <= grid.shape[0] and nx <= grid.shape[1]
+    if fits and n_psf > 0:  # PyTorch does not transform none
         # The same sums, by a fast transform.
         middle = xp.asarray(
             [[0.5 * (nx - 1), 0.5 * (ny - 1)]], dtype=image.dtype, device=device_of(image)
