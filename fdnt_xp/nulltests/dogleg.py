@@ -10,8 +10,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
-from functools import reduce
-from operator import add
 from types import ModuleType
 from typing import Final, Protocol, Self
 
@@ -25,6 +23,7 @@ from fdnt_xp.arrays import (
     require_dtype,
 )
 from fdnt_xp.errors import FdntValueError, RangeError, ShapeMismatchError
+from fdnt_xp.nulltests.small_systems import add_up, largest, newton_step, nonzero, norm, scale_of
 
 # Nocedal & Wright 2006, algorithm 4.1, for the ratio of the real to the promised reduction
 # of the merit; they leave _ACCEPT free in [0, 1/4).
@@ -33,7 +32,7 @@ _SHRINK_BELOW, _SHRINK = 0.25, 0.25
 _GROW_ABOVE, _GROW = 0.75, 2.0
 _AT_BOUNDARY: Final = 0.99  # of the radius: such a step was held back by it
 _SHRINK_OUTSIDE: Final = 0.1  # outside the domain there is no ratio, and the model is no guide
-_SINGULAR: Final = 10.0  # eps: smallest pivot, in a row scaled to 1, of a matrix worth solving
+_SLOW: Final = 0.01  # of |f|²: a step that takes off less wears out the patience
 _FLAT: Final = 4.0  # eps: a smaller promised part of the merit is its rounding
 _ROUNDING: Final = 100.0  # ftol: |f| at which a row that cannot move is taken for a root
 _MAX_UNKNOWNS: Final = 6  # the small algebra is written out, which does not pay for more
@@ -98,6 +97,9 @@ class DoglegOptions:
         Finished rows leave the batch when no more than this fraction of it runs. It changes
         the speed, as does `check_every`, never the result. Default: 0.75, and 0 (never)
         where each new length of a batch is compiled anew.
+    patience : int, optional
+        A row is stalled after so many steps in a row that took less than 1 % off `|f|²`.
+        Default: never.
     """
 
     ftol: float | None = None
@@ -107,6 +109,7 @@ class DoglegOptions:
     min_radius: float | None = None
     check_every: int = 1
     compact_below: float | None = None
+    patience: int | None = None
 
     def __post_init__(self) -> None:
         """Refuse numbers that mean nothing."""
@@ -119,11 +122,13 @@ class DoglegOptions:
             ("min_radius", 0, self.initial_radius),
             ("check_every", 1, infinity),
             ("compact_below", 0, 1),
+            ("patience", 1, infinity),
         ):
             value = getattr(self, name)
             if value is not None and not low <= value <= high:  # which NaN is not
                 raise RangeError(name, value, low, None if high == infinity else high)
-            if name in ("max_iter", "check_every") and not isinstance(value, int):
+            whole = name in ("max_iter", "check_every", "patience") and value is not None
+            if whole and not isinstance(value, int):
                 raise FdntValueError(f"{name} must be an integer, not {value!r}")
         if self.initial_radius == 0 or self.max_radius == infinity:
             raise FdntValueError("initial_radius must be positive and max_radius finite")
@@ -173,6 +178,7 @@ class RootResult:
 @dataclass(frozen=True, kw_only=True)
 class _State(RootResult):
     index: Array  # the place of the row in the batch of the caller
+    n_slow: Array  # steps since one that took something off |f|²
 
 
 _DEFAULTS: Final = DoglegOptions()
@@ -212,7 +218,7 @@ def find_root(problem: RootProblem, x0: Array, *, options: DoglegOptions = _DEFA
        the row being as near to the root as the rounding of its `f` allows.
     3. RADIUS_TOO_SMALL: a step was rejected and left a radius `<= min_radius`.
     4. STALLED: the step is `|p_i| <= eps |x_i|` for all i, or promises to reduce `|f|²` by
-       no more than `4 eps |f|²`, as in a local minimum.
+       no more than `4 eps |f|²`, as in a local minimum, or `patience` is at an end.
     5. MAX_ITER: `max_iter` steps were tried.
 
     `|f|` never grows from one accepted point to the next. A step costs one evaluation; the
@@ -231,6 +237,7 @@ def find_root(problem: RootProblem, x0: Array, *, options: DoglegOptions = _DEFA
         compact_below = 0.0 if compiles_every_shape(xp) else 0.75
     state = _start(xp, problem, x0, options.initial_radius, ftol)
     finished: list[_State] = []
+    limits = (ftol, least, options.max_radius)
     for i in range(options.max_iter):
         if i % options.check_every == 0:
             done = xp.astype(state.status != int(Status.RUNNING), xp.int32)
@@ -242,7 +249,7 @@ def find_root(problem: RootProblem, x0: Array, *, options: DoglegOptions = _DEFA
                 order = xp.argsort(done, stable=True)
                 finished.append(state.take(order[n_running:]))
                 state, problem = state.take(order[:n_running]), problem.take(order[:n_running])
-        state = _step(xp, problem, state, (ftol, least, options.max_radius))
+        state = _step(xp, problem, state, limits, options.patience)
     return _collect(xp, [*finished, state])
 
 
@@ -261,15 +268,18 @@ def _start(xp: ModuleType, problem: RootProblem, x: Array, radius: float, ftol: 
     none = xp.zeros_like(radii, dtype=xp.int32)
     index = xp.arange(x.shape[0], dtype=xp.int64, device=device_of(x))
     status = xp.full_like(none, int(Status.RUNNING))
-    status = _mark(xp, status, _size(xp, f) <= ftol, Status.CONVERGED)
+    status = _mark(xp, status, largest(xp, f) <= ftol, Status.CONVERGED)
     status = _mark(xp, status, ~finite, Status.NON_FINITE)
-    return _State(
-        x=x, f=f, jac=jac, radius=radii, status=status, n_iter=none, n_eval=none + 1, index=index
-    )
+    counts = {"n_iter": none, "n_eval": none + 1, "n_slow": none}
+    return _State(x=x, f=f, jac=jac, radius=radii, status=status, index=index, **counts)
 
 
 def _step(
-    xp: ModuleType, problem: RootProblem, state: _State, limits: tuple[float, float, float]
+    xp: ModuleType,
+    problem: RootProblem,
+    state: _State,
+    limits: tuple[float, float, float],
+    patience: int | None,
 ) -> _State:
     """Try one step of every running row; leave the others as they are."""
     (ftol, min_radius, max_radius), eps = limits, float(xp.finfo(state.x.dtype).eps)
@@ -282,12 +292,12 @@ def _step(
     step = _dogleg_step(xp, f, jac, radius)
     f_trial, jac_trial, inside = _evaluate(xp, problem, state.x + step)
 
-    promised = _reduction(xp, f, f + _add_up(xp, jac * step[:, None, :]))
+    promised = _reduction(xp, f, f + add_up(xp, jac * step[:, None, :]))
     real = _reduction(xp, f, xp.where(inside[:, None], f_trial, f))
     # Written without a division: the promise may be 0.
     accept = running & inside & (promised > 0.0) & (real >= _ACCEPT * promised)
     f = xp.where(accept[:, None], f_trial, state.f)
-    length = _norm(xp, step)
+    length = norm(xp, step)
     grows = (real > _GROW_ABOVE * promised) & (length >= _AT_BOUNDARY * radius)
     grown = xp.minimum(_GROW * radius, xp.full_like(radius, max_radius))
     radius = xp.where(grows, grown, radius)
@@ -295,8 +305,12 @@ def _step(
     radius = xp.where(inside, radius, _SHRINK_OUTSIDE * length)
     still = xp.all(xp.abs(step) <= eps * xp.abs(state.x), axis=-1)
     stalled = inside & (still | (promised <= _FLAT * eps))
+    slow = ~(accept & (real >= _SLOW))
+    n_slow = xp.where(slow, state.n_slow + 1, xp.zeros_like(state.n_slow))
+    if patience is not None:
+        stalled = stalled | (n_slow >= patience)
     too_small = ~accept & (radius <= min_radius)
-    size = _size(xp, f)
+    size = largest(xp, f)
     rounding = (stalled | too_small) & (size <= _ROUNDING * ftol)
     # The later mark decides over the earlier.
     status = _mark(xp, state.status, stalled, Status.STALLED)
@@ -311,6 +325,7 @@ def _step(
         n_iter=state.n_iter + xp.astype(running, xp.int32),
         n_eval=state.n_eval + xp.astype(running, xp.int32),
         index=state.index,
+        n_slow=n_slow,
     )
 
 
@@ -319,67 +334,30 @@ def _dogleg_step(xp: ModuleType, f: Array, jac: Array, radius: Array) -> Array:
     newton, solved = newton_step(xp, f, jac)
     cauchy = _cauchy_step(xp, f, jac, radius)
     # |cauchy + s u| = radius, u the direction from Cauchy to Newton; in units of the radius.
-    distance = _norm(xp, newton - cauchy)
-    unit = (newton - cauchy) / _safe(xp, distance)[:, None]
+    distance = norm(xp, newton - cauchy)
+    unit = (newton - cauchy) / nonzero(xp, distance)[:, None]
     start = cauchy / radius[:, None]
-    along = _add_up(xp, start * unit)
-    gap = xp.abs(1.0 - _add_up(xp, start * start))  # never below 0 but by rounding
+    along = add_up(xp, start * unit)
+    gap = xp.abs(1.0 - add_up(xp, start * start))  # never below 0 but by rounding
     root = xp.sqrt(along * along + gap)
     # The form of the positive root that does not cancel; along < 0 is rounding.
-    s = xp.minimum(gap / _safe(xp, xp.abs(along) + root) * radius, distance)
+    s = xp.minimum(gap / nonzero(xp, xp.abs(along) + root) * radius, distance)
     bent = xp.where(solved[:, None], cauchy + s[:, None] * unit, cauchy)
-    return xp.where((solved & (_norm(xp, newton) <= radius))[:, None], newton, bent)
+    return xp.where((solved & (norm(xp, newton) <= radius))[:, None], newton, bent)
 
 
 def _cauchy_step(xp: ModuleType, f: Array, jac: Array, radius: Array) -> Array:
     """Return the minimum of `|f + J p|` along `-Jᵀ f`, cut at the radius."""
     # p = -(|g|/|J u|²) u, g = Jᵀ f, u = g/|g|; f and J scaled, lest squares over- or underflow.
-    size_f = _safe(xp, _size(xp, f))
-    size_j = _scale(xp, xp.max(_size(xp, jac), axis=-1), size_f)
+    size_f = nonzero(xp, largest(xp, f))
+    size_j = scale_of(xp, xp.max(largest(xp, jac), axis=-1), size_f)
     jac = jac / size_j[:, None, None]
-    gradient = _add_up(xp, jac * (f / size_f[:, None])[:, :, None], axis=1)
-    slope = _norm(xp, gradient)
-    unit = gradient / _safe(xp, slope)[:, None]
-    rate = _safe(xp, _norm(xp, _add_up(xp, jac * unit[:, None, :])))
+    gradient = add_up(xp, jac * (f / size_f[:, None])[:, :, None], axis=1)
+    slope = norm(xp, gradient)
+    unit = gradient / nonzero(xp, slope)[:, None]
+    rate = nonzero(xp, norm(xp, add_up(xp, jac * unit[:, None, :])))
     length = xp.minimum(slope / rate / rate * (size_f / size_j), radius)
     return -length[:, None] * unit
-
-
-def newton_step(xp: ModuleType, f: Array, jac: Array) -> tuple[Array, Array]:
-    """Solve `J p = -f`; return p, and where J is regular; elsewhere p = 0.
-
-    Gauss-Jordan elimination, rows scaled by their largest element, pivots from unused rows.
-    Not `linalg.solve`: there one singular matrix raises for the batch (numpy, torch) or the
-    host waits (CUDA), the kernel depends on the size of the batch, and a determinant to
-    screen by would be a second factorisation.
-    """
-    tiny = _SINGULAR * float(xp.finfo(f.dtype).eps)
-    n, d = f.shape
-    place = xp.arange(d, dtype=xp.int64, device=device_of(f))[:, None]
-    scale = _scale(xp, _size(xp, jac), _size(xp, f)[:, None])
-    work = xp.concat([jac, -f[..., None]], axis=-1) / scale[..., None]
-    # The batch last, in memory too: a library then runs along it, and not along four numbers.
-    numbers = xp.unstack(xp.reshape(work, (n, d * (d + 1))), axis=1)
-    work = xp.reshape(xp.stack(numbers, axis=0), (d, d + 1, n))
-    unused, columns = xp.ones_like(work[:, 0, :], dtype=xp.bool), []
-    regular = xp.all(unused, axis=0)
-    for k in range(d):
-        column = work[:, k, :]
-        candidates = xp.where(unused, xp.abs(column), -xp.ones_like(column))
-        here = place == xp.argmax(candidates, axis=0, keepdims=True)
-        # A sum of which one term is not 0 is a selection, and exact.
-        row = xp.sum(xp.where(here[:, None, :], work, xp.zeros_like(work)), axis=0)
-        fair = xp.max(candidates, axis=0) > tiny
-        row = row / xp.where(fair, row[k, :], xp.ones_like(row[k, :]))
-        rest = work - column[:, None, :] * row
-        work = xp.where(here[:, None, :], row, rest)
-        unused, regular = unused & ~here, regular & fair
-        columns.append(here)
-    answer = work[:, -1, :]
-    zero = xp.zeros_like(answer)
-    step = xp.stack([xp.sum(xp.where(h, answer, zero), axis=0) for h in columns], axis=-1)
-    regular = regular & xp.all(xp.isfinite(step), axis=-1)
-    return xp.where(regular[:, None], step, xp.zeros_like(step)), regular
 
 
 def _collect(xp: ModuleType, parts: list[_State]) -> RootResult:
@@ -406,35 +384,10 @@ def _evaluate(xp: ModuleType, problem: RootProblem, x: Array) -> tuple[Array, Ar
 
 def _reduction(xp: ModuleType, f: Array, new: Array) -> Array:
     """Return `1 - |new|²/|f|²`, cut at -3, where the ratio is still far from overflow."""
-    size = _norm(xp, f)
-    ratio = xp.minimum(_norm(xp, new), 2.0 * size) / _safe(xp, size)
+    size = norm(xp, f)
+    ratio = xp.minimum(norm(xp, new), 2.0 * size) / nonzero(xp, size)
     return 1.0 - ratio * ratio
 
 
 def _mark(xp: ModuleType, status: Array, rows: Array, code: Status) -> Array:
     return xp.where(rows, xp.full_like(status, int(code)), status)
-
-
-def _safe(xp: ModuleType, denominator: Array) -> Array:
-    return xp.where(denominator == 0.0, xp.ones_like(denominator), denominator)
-
-
-def _scale(xp: ModuleType, size: Array, size_f: Array) -> Array:
-    """Return the size of J, infinite (J is 0) where `|f|/|J|` is absurd and might overflow."""
-    sane = size > float(xp.finfo(size.dtype).eps) ** 4 * size_f
-    return xp.where(sane, size, xp.full_like(size, float("inf")))
-
-
-def _size(xp: ModuleType, array: Array) -> Array:
-    return xp.max(xp.abs(array), axis=-1)
-
-
-def _norm(xp: ModuleType, vector: Array) -> Array:
-    size = _size(xp, vector)
-    scaled = vector / _safe(xp, size)[:, None]
-    return size * xp.sqrt(_add_up(xp, scaled * scaled))
-
-
-def _add_up(xp: ModuleType, terms: Array, axis: int = -1) -> Array:
-    """Add from left to right: `sum` and `matmul` let layout and batch choose the order."""
-    return reduce(add, xp.unstack(terms, axis=axis))

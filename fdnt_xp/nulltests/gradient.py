@@ -10,7 +10,7 @@ much along its own axis (B10 §5.1), with
 from __future__ import annotations
 
 from fdnt_xp.arrays import Array, array_namespace, device_of
-from fdnt_xp.nulltests.dogleg import newton_step
+from fdnt_xp.nulltests.small_systems import newton_step
 from fdnt_xp.nulltests.values import MatchedWidth, TestValues
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from fdnt_xp.arrays import Array, array_namespace, device_of
-from fdnt_xp.nulltests.dogleg import newton_step
+from fdnt_xp.nulltests.small_systems import newton_step
 from fdnt_xp.peers.batch import Fitted, in_domain
 from fdnt_xp.peers.drawing import Drawing
 from fdnt_xp.peers.levenberg import find_minimum, inverse_of_normal

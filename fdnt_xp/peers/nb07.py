@@ -26,8 +26,9 @@ from numpy.typing import NDArray
 
 from fdnt_xp.arrays import Array, array_namespace, device_of
 from fdnt_xp.fourier.psf import Psf
-from fdnt_xp.nulltests.dogleg import DoglegOptions, Status, find_root, newton_step
+from fdnt_xp.nulltests.dogleg import DoglegOptions, Status, find_root
 from fdnt_xp.nulltests.scaled import inverse_if_positive
+from fdnt_xp.nulltests.small_systems import newton_step
 from fdnt_xp.peers.batch import Fitted, Weighted, in_domain, measure_in_chunks, shapes_of
 from fdnt_xp.peers.circular import CIRCULAR_METHODS
 from fdnt_xp.peers.drawing import Drawing

@@ -18,8 +18,8 @@ from fdnt_xp.nulltests.dogleg import (
     Status,
     default_ftol,
     find_root,
-    newton_step,
 )
+from fdnt_xp.nulltests.small_systems import newton_step
 from fdnt_xp.nulltests.tests import NullTests
 from fdnt_xp.shapes.centroid import starting_centroid, wide_weight
 from fdnt_xp.shapes.job import Job
@@ -30,6 +30,8 @@ FINE_ABOVE: Final = 1.5
 COARSE_STEPS: Final = 12
 """Steps of the root finder on the coarse grid: who converges there needs seldom more than 8."""
 
+_PATIENCE: Final = 6
+"""Steps without progress, as in a local minimum, after which a galaxy has no shape."""
 _NEAR: Final = 0.3
 """Of the root of ftol: a Newton step from there, whose error is a square, meets ftol."""
 _LONGEST: Final = 0.01
@@ -91,7 +93,9 @@ def search(
     ftol = default_ftol(xp, start.dtype)
     if last_step_free:
         ftol = _NEAR * math.sqrt(ftol)
-    options = DoglegOptions(ftol=ftol, max_iter=max_iter, initial_radius=1.0, max_radius=3.0)
+    options = DoglegOptions(
+        ftol=ftol, max_iter=max_iter, initial_radius=1.0, max_radius=3.0, patience=_PATIENCE
+    )
     root = find_root(tests, start, options=options)
     if not last_step_free:
         return root

@@ -8,8 +8,9 @@ from typing import Any, Final, Protocol
 
 from fdnt_xp.arrays import Array, array_namespace, device_of, has_any
 from fdnt_xp.flags import FAILED, Flag
-from fdnt_xp.nulltests.dogleg import RootResult, Status, newton_step
+from fdnt_xp.nulltests.dogleg import RootResult, Status
 from fdnt_xp.nulltests.gradient import ellipticity_gradient
+from fdnt_xp.nulltests.small_systems import newton_step
 from fdnt_xp.nulltests.tests import NullTests
 from fdnt_xp.nulltests.values import MatchedWidth, TestNoise, TestValues
 from fdnt_xp.shapes.results import ShapeResult
