@@ -299,6 +299,16 @@ def test_a_local_minimum_is_no_root():
     assert np.sum(result.f**2) == pytest.approx(48.9843, abs=1e-4)
 
 
+def test_patience_ends_a_crawl_and_nothing_else():
+    start = np.array([[0.5, -2.0], [5.5, 4.5]])  # of the local minimum, and of the root
+    plain = solve(freudenstein_roth, start, max_iter=200)
+    patient = solve(freudenstein_roth, start, max_iter=200, patience=3)
+    assert [Status(int(code)) for code in patient.status] == [Status.STALLED, Status.CONVERGED]
+    np.testing.assert_allclose(np.sum(patient.f[0] ** 2), 48.9843, rtol=0.02)
+    assert patient.n_iter[0] < plain.n_iter[0]
+    assert_same(patient.take(np.array([1])), plain.take(np.array([1])), np.asarray)
+
+
 @pytest.mark.parametrize("system", [freudenstein_roth, broyden_tridiagonal])
 def test_on_every_library(system, xp, dtype, to_xp, to_np):
     start, _, n_iter, _ = HARD[system]
@@ -649,6 +659,8 @@ def test_nothing_given_is_written_to(dtype, to_xp, to_np):
         ({"check_every": 1.5}, FdntValueError, "check_every must be an integer, not 1.5"),
         ({"compact_below": 1.5}, RangeError, r"compact_below = 1.5 .* \[0, 1\]"),
         ({"compact_below": math.nan}, RangeError, "compact_below = nan"),
+        ({"patience": 0}, RangeError, "patience = 0"),
+        ({"patience": 1.5}, FdntValueError, "patience must be an integer, not 1.5"),
     ],
     ids=str,
 )

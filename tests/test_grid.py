@@ -73,8 +73,20 @@ def test_index_names_the_mode_of_the_transform(shape, xp, dtype, make_grid, to_x
         wave = np.cos(nx * cell_x * x + ny * cell_y * y)
         spectrum = np.abs(np.fft.rfft2(wave)).ravel()[index]
         assert np.argmax(spectrum) == mode
-    assert np.all(np.diff(index) > 0)
+    assert len(set(index.tolist())) == grid.n_k
     assert np.max(index) < grid.n_half_plane == np.fft.rfft2(np.zeros(shape)).size
+
+
+def test_the_first_modes_are_those_of_a_smaller_disc(xp, dtype, make_grid, to_np):
+    whole, small = make_grid((8, 9), KMAX, dtype), make_grid((8, 9), 0.6 * KMAX, dtype)
+    radius = np.hypot(to_np(whole.kx), to_np(whole.ky))
+    assert np.all(np.diff(radius) >= -1e-6)
+    n_k = whole.n_inside(0.6 * KMAX)
+    assert n_k == small.n_k < whole.n_k
+    inner = whole.inner(n_k)
+    for name in ("kx", "ky", "fold", "index"):
+        assert_equal(getattr(inner, name), getattr(small, name), xp=xp)
+    assert to_np(whole.number_of(inner.index)).tolist() == list(range(n_k))
 
 
 def test_opposite_modes_count_twice_and_the_middle_once(dtype, make_grid, to_np):

@@ -9,19 +9,19 @@ small matrices, with the half-plane weight folded in.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from types import ModuleType
 
 import numpy as np
 
-from fdnt_xp.arrays import Array, Device, DType, Rows, array_namespace
+from fdnt_xp.arrays import Array, Device, DType, Rows, array_namespace, count_true
 from fdnt_xp.shear import shear_matrix
 
 
 @dataclass(frozen=True, kw_only=True)
 class KGrid:
-    """Fourier modes inside a disc, for stamps of one shape.
+    """Fourier modes inside a disc, from the middle outwards, for stamps of one shape.
 
     Parameters
     ----------
@@ -84,9 +84,30 @@ class KGrid:
         new_row = xp.where(other, column, (side - column) % side)
         new_column = xp.where(ky < 0, -ky, ky)
         position = new_row * (self.shape[1] // 2 + 1) + new_column
-        source = xp.searchsorted(self.index, position)
         one = xp.ones_like(self.kx)
-        return source, xp.where(other, -one, one)
+        return self.number_of(position), xp.where(other, -one, one)
+
+    def number_of(self, position: Array) -> Array:
+        """Return which modes of this grid are at these positions in the flattened `rfftn`.
+
+        n_k, or any number, where none is.
+        """
+        xp = array_namespace(kx=self.kx)
+        order = xp.argsort(self.index)
+        place = xp.searchsorted(xp.take(self.index, order), position)
+        outside = place == self.n_k
+        number = xp.take(order, xp.where(outside, xp.zeros_like(place), place))
+        return xp.where(outside, xp.full_like(number, self.n_k), number)
+
+    def inner(self, n_k: int) -> KGrid:
+        """Return the grid of the first modes, which are those nearest to k = 0 in the data."""
+        return replace(
+            self, kx=self.kx[:n_k], ky=self.ky[:n_k], fold=self.fold[:n_k], index=self.index[:n_k]
+        )
+
+    def n_inside(self, radius: float) -> int:
+        """Return how many modes have `|k| < radius`, on the host."""
+        return count_true(self.kx**2 + self.ky**2 < radius**2)
 
     @property
     def radius(self) -> Array:
@@ -193,7 +214,9 @@ def half_plane_disc(
         2.0 * np.pi * np.fft.fftfreq(ny), 2.0 * np.pi * np.fft.rfftfreq(nx), indexing="ij"
     )
     in_half_plane = (kx > 0) | ((kx == 0) & (ky >= 0))
-    index = np.flatnonzero(in_half_plane & (np.hypot(kx, ky) < kmax))
+    radius = np.hypot(kx, ky)
+    index = np.flatnonzero(in_half_plane & (radius < kmax))
+    index = index[np.argsort(radius.ravel()[index], kind="stable")]
     kx, ky = kx.ravel()[index], ky.ravel()[index]
     fold = np.where((kx == 0) & (ky == 0), 1.0, 2.0)
     return KGrid(

@@ -51,6 +51,10 @@ class SkyGrid(KGrid):
             return self
         return SkyGrid.of(self.plain, rows_of(self.matrix, rows))
 
+    def inner(self, n_k: int) -> SkyGrid:
+        """Return the grid of the first modes, those nearest to k = 0 in the data."""
+        return SkyGrid.of(self.plain.inner(n_k), self.matrix)
+
     @property
     def radius(self) -> Array:
         """`|M k|`, shape (n_gal or 1, n_k)."""

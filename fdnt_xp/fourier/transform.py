@@ -28,6 +28,10 @@ class DeconvolvedStamps:
         """Return the galaxies with the given row numbers."""
         return DeconvolvedStamps(re=rows_of(self.re, rows), im=rows_of(self.im, rows))
 
+    def inner(self, n_k: int) -> DeconvolvedStamps:
+        """Return the first modes, those of `KGrid.inner`."""
+        return DeconvolvedStamps(re=self.re[:, :n_k], im=self.im[:, :n_k])
+
     def shifted(self, grid: KGrid, centroid: Array) -> tuple[Array, Array]:
         """Return `Re` and `Im` of `exp(+i k.x0) I~(k)`: the galaxies moved to the origin.
 

@@ -19,6 +19,8 @@ from fdnt_xp.shear import shear_matrix
 
 _WIDE: Final = 0.125
 """Size of the weight of the first centroid, in sides of the stamp: it reaches a third of it."""
+_LEAST_WEIGHT: Final = 1e-4
+"""Of a mode that is looked at for a first centroid, in units of that at k = 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,6 +91,11 @@ def starting_centroid(
 
     Where no centroid is found within `reach` pixels, the centre of the stamp.
     """
+    xp = array_namespace(weight=weight)
+    # A host read: a wide weight is narrow in k, and its modes are few.
+    number = xp.arange(grid.n_k, dtype=xp.int64, device=device_of(weight))
+    n_k = 1 + int(xp.max(xp.where(weight > _LEAST_WEIGHT, number, xp.zeros_like(number))))
+    grid, galaxies, weight = grid.inner(n_k), galaxies.inner(n_k), weight[:, :n_k]
     problem = DipoleTests(grid=grid, galaxies=galaxies, weight=weight, length=length)
     return find_centroid(problem, galaxies.re[:, :2], length, reach=reach)
 

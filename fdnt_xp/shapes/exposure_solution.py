@@ -19,9 +19,11 @@ from fdnt_xp.shapes.search import (
     COARSE_STEPS,
     FINE_ABOVE,
     looked_at,
+    one_step_off,
     round_start,
     search,
     squeezed,
+    stepped,
 )
 from fdnt_xp.shapes.solution import SolutionNoise, describe_at_origin
 
@@ -159,9 +161,7 @@ def solve_objects(
     """Solve objects on the coarse grid, then the few that need it on the fine one."""
     xp = array_namespace(flags=flags)
     max_iter = min(objects.job.max_iter, COARSE_STEPS)
-    result, root = _solved_on(
-        objects, tests, inverse_transfer, flags, max_iter=max_iter, last_step_free=True
-    )
+    result, root = _solved_on(objects, tests, inverse_transfer, flags, max_iter=max_iter)
     eta, _ = tests.on_stamps(root.x)
     narrow = squeezed(eta, objects.job.weight.frame) > FINE_ABOVE
     narrow = tests.exposures.total(xp.astype(narrow, eta.dtype)) > 0
@@ -199,13 +199,12 @@ def _solved_on(
     *,
     max_iter: int,
     known: RootResult | None = None,
-    last_step_free: bool = False,
 ) -> tuple[ObjectShapes, RootResult]:
-    """Solve objects on one grid; see `fdnt_xp.shapes.search.search`."""
+    """Solve objects on one grid, but for two Newton steps, the second from tests with noise."""
     xp = array_namespace(flags=flags)
     job, exposures = objects.job, tests.exposures
     start = round_start(objects.look.offset, job.length)
-    root = search(tests, start, known, max_iter=max_iter, last_step_free=last_step_free)
+    root = stepped(search(tests, start, known, max_iter=max_iter, near=one_step_off(start)))
     eta, centroid = tests.on_stamps(root.x)
     stamps, widths = tests.stamps, None
     if exposures.n_each > 1 and tests.fixed_width is None:
@@ -215,8 +214,7 @@ def _solved_on(
         stamps, eta, centroid, inverse_transfer, n_at_once=objects.n_at_once
     )
     summed, matched = tests.summed(noise.tests, noise.matched if widths is None else widths)
-    if last_step_free:
-        root = looked_at(root, *tests.scaled(root.x[:, :2], summed, matched))
+    root = looked_at(root, *tests.scaled(root.x[:, :2], summed, matched))
     flux, variance = _mean_flux(exposures, noise, objects.look.flux_share)
     combined = SolutionNoise(
         tests=summed,

@@ -95,7 +95,7 @@ def on_pixels(h: Array, grid: KGrid, stamp_shape: tuple[int, int]) -> Array:
     row, column = grid.row_and_column
     n_column = grid.shape[1] // 2 + 1
     every = xp.arange(grid.n_half_plane, dtype=xp.int64, device=device_of(grid.kx))
-    place = xp.searchsorted(grid.index, every)
+    place = grid.number_of(every)
     place = xp.minimum(place, xp.full_like(place, grid.n_k - 1))
     there = xp.take(row * n_column + column, place) == every
     half = xp.where(there, xp.take(h, place, axis=2), xp.zeros_like(h[:, :, :1]))

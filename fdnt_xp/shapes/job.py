@@ -35,6 +35,8 @@ _FEWEST_ON_A_PSF: Final = 32
 """Galaxies for each PSF, in the mean, from which those that share one are taken together."""
 _FEWEST_TO_MEASURE: Final = 1024
 """The same where each chunk ends with a search for its slowest few: see `Job.chunks`."""
+_ROUGH_FLOOR: Final = 0.03
+"""Of 𝒯: where the weight of a first search ends, on a fraction of the modes."""
 _BYTES_AT_ONCE: Final = 128e6
 """Memory of a chunk of galaxies."""
 _FIELDS: Final = 24
@@ -76,6 +78,8 @@ class Job:
         Fixed size of the weight, pixels.
     max_iter : int
         Steps of the root finder.
+    rough : Weight, optional
+        Of each PSF, ending early, for a first search on the modes within `rough_kmax`.
     """
 
     psf: Psf
@@ -85,6 +89,8 @@ class Job:
     length: float
     size: Array | None
     max_iter: int
+    rough: Weight | None = None
+    rough_kmax: float = math.pi
 
     def chunks(self, n_gal: int, n_chunk: int, *, searched: bool = False) -> list[Chunk]:
         """Return all galaxies in parts of at most `n_chunk`: by their PSF if many share one.
@@ -118,7 +124,9 @@ class Job:
         number = xp.asarray([chunk.psf_number], dtype=xp.int64, device=device_of(self.psf.kmax))
         psf = replace(self.psf, index=None).take(number)
         size = _of_rows(self.size, chunk.rows)
-        return replace(self, psf=psf, weight=self.weight.take(number), size=size)
+        return replace(
+            self, psf=psf, weight=self.weight.take(number), size=size, rough=self._rough(number)
+        )
 
     def some(self, rows: Rows) -> Job:
         """Return the job of the given galaxies; PSFs that galaxies share stay shared."""
@@ -137,7 +145,16 @@ class Job:
             device = device_of(self.psf.kmax)
             rows = xp.arange(rows.start, rows.stop, dtype=xp.int64, device=device)
         numbers = self.psf.numbers_of(rows)
-        return replace(self, psf=self.psf.take(rows), weight=self.weight.take(numbers), size=size)
+        return replace(
+            self,
+            psf=self.psf.take(rows),
+            weight=self.weight.take(numbers),
+            size=size,
+            rough=self._rough(numbers),
+        )
+
+    def _rough(self, numbers: Array) -> Weight | None:
+        return None if self.rough is None else self.rough.take(numbers)
 
 
 def _of_rows(size: Array | None, rows: Rows) -> Array | None:
@@ -203,8 +220,17 @@ def prepare(
     size: Array | None = None,
     matched: bool = True,
     max_iter: int = 0,
+    rough: bool = False,
 ) -> Job:
-    """Make the k grids and the tables of the weight; `matched` if its size may be the galaxy's."""
+    """Make the k grids and the tables of the weight.
+
+    Parameters
+    ----------
+    matched : bool
+        Whether the size of the weight may be the galaxy's.
+    rough : bool
+        Whether there is to be a first search under a weight that ends early.
+    """
     ny, nx = (int(n) for n in stamps.shape[1:])
     shape = (padding * ny, padding * nx)
     cell = 2.0 * math.pi / min(ny, nx)
@@ -215,6 +241,7 @@ def prepare(
             "such stamps resolve"
         )
     like = {"dtype": stamps.dtype, "device": device_of(stamps)}
+    early = psf.ending_at(_ROUGH_FLOOR) if rough else None
     return Job(
         psf=psf.restricted(_FEWEST_CELLS * cell),
         # A weight of this size is one cell of the k grid wide.
@@ -224,6 +251,8 @@ def prepare(
         length=3.0 / psf.largest_kmax,
         size=size,
         max_iter=max_iter,
+        rough=None if early is None else make_weight(early, largest_size=1.0 / cell),
+        rough_kmax=math.pi if early is None else early.largest_kmax,
     )
 
 

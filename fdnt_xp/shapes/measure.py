@@ -37,7 +37,17 @@ from fdnt_xp.shapes.job import (
 from fdnt_xp.shapes.laguerre import check_order, n_coefficients
 from fdnt_xp.shapes.pixels import Pixels, check_pixels
 from fdnt_xp.shapes.results import ShapeResult
-from fdnt_xp.shapes.search import COARSE_STEPS, FINE_ABOVE, looked_at, solve, squeezed
+from fdnt_xp.shapes.search import (
+    COARSE_STEPS,
+    FINE_ABOVE,
+    TWO_STEPS_OFF,
+    looked_at,
+    one_step_off,
+    rough_root,
+    solve,
+    squeezed,
+    stepped,
+)
 from fdnt_xp.shapes.sky import SkyFrame, sky_frame
 from fdnt_xp.shapes.solution import describe_with, solution_of
 from fdnt_xp.shapes.sources import (
@@ -164,7 +174,7 @@ def measure_shapes(
 
     seen = psf if sky is None else sky.seen_by(psf)
     fixed = _fixed_size(xp, stamps, size, sky)
-    job = prepare(xp, stamps, seen, padding=padding, size=fixed, max_iter=max_iter)
+    job = prepare(xp, stamps, seen, padding=padding, size=fixed, max_iter=max_iter, rough=True)
     n_chunk = chunk_size or galaxies_in_memory(job, pixels, transform, order)
     chunks = job.chunks(n_gal, n_chunk, searched=True)
     result = ShapeResult.concat(
@@ -246,7 +256,7 @@ def _measure_source(job: Job, source: Source, pixels: Pixels, flags: Array) -> S
     measurable = xp.bitwise_and(flags, xp.full_like(flags, ~int(Flag.FILLED))) == 0
     # Whoever is not there by then is measured again, and need not hold up a small batch.
     few = replace(job, max_iter=min(job.max_iter, COARSE_STEPS))
-    result, root, finer = _measure_on(few, job.coarse, source, shape, flags, last_step_free=True)
+    result, root, finer = _measure_on(few, job.coarse, source, shape, flags, near=TWO_STEPS_OFF)
     finer = finer & measurable
     # A host read: how many need the fine grid decides the size of that batch.
     n_fine = count_true(finer)
@@ -273,14 +283,15 @@ def _measure_on(
     stamp_shape: tuple[int, int],
     flags: Array,
     *,
-    last_step_free: bool = False,
+    near: float | None = None,
     known: RootResult | None = None,
 ) -> tuple[ShapeResult, RootResult, Array]:
     """Measure on one grid; return shapes, roots, and which a finer grid should measure again.
 
-    Roots that are `known`, of a coarser grid, are where the search starts. With
-    `last_step_free` the last Newton step is taken without an evaluation of its own: the noise
-    evaluates the tests there anyhow. Where they show a poor step, there is no success.
+    Roots that are `known`, of a coarser grid, are where the search starts. It ends where the
+    tests are below `near`, by default where one Newton step is enough. Two are taken: the
+    first without an evaluation of its own, as the noise evaluates the tests there anyhow, and
+    the second from there. Where that is a long one, there is no success.
     """
     xp = array_namespace(flags=flags)
     inverse_transfer = job.psf.inverse_transfer(grid)
@@ -289,11 +300,14 @@ def _measure_on(
     tests = NullTests(
         grid=grid, galaxies=galaxies, weight=job.weight, length=job.length, fixed_width=fixed
     )
-    root = solve(job, tests, min(stamp_shape), known, last_step_free=last_step_free)
+    side = min(stamp_shape)
+    if known is None:
+        known = rough_root(job, tests, side)
+    near = one_step_off(galaxies.re) if near is None else near
+    root = stepped(solve(job, tests, side, known, near=near))
     eta, centroid = solution_of(tests, root)
     noise = source.noise(tests, eta, centroid, inverse_transfer)
-    if last_step_free:
-        root = looked_at(root, *tests.scaled(eta, noise.tests, noise.matched))
+    root = looked_at(root, *tests.scaled(eta, noise.tests, noise.matched))
     result = describe_with(tests, root, noise, stamp_shape=stamp_shape, flags=flags)
     return result, root, (squeezed(eta, job.weight.frame) > FINE_ABOVE) | ~root.success
 

@@ -30,14 +30,23 @@ FINE_ABOVE: Final = 1.5
 COARSE_STEPS: Final = 12
 """Steps of the root finder on the coarse grid: who converges there needs seldom more than 8."""
 
+_ROUGH_STEPS: Final = 6
+"""Steps of the first search, under a weight that ends early."""
+_ROUGH_TESTS: Final = 0.01
+"""What the tests may be at its end, and the longest step that is taken from there."""
+_LONGEST_ROUGH: Final = 0.1
+TWO_STEPS_OFF: Final = 3e-4
+"""Tests from which two Newton steps make them vanish."""
 _PATIENCE: Final = 6
 """Steps without progress, as in a local minimum, after which a galaxy has no shape."""
 _NEAR: Final = 0.3
 """Of the root of ftol: a Newton step from there, whose error is a square, meets ftol."""
 _LONGEST: Final = 0.01
 """Such a step, in units of eta and of L: a longer one is due to a Jacobian that is no guide."""
+_LAST_STEP: Final = 1e-4
+"""Longest second step, whose error is about its square; in float32 what its ftol asks for."""
 _ROUNDING: Final = 10.0
-"""Times ftol: largest test after such a step."""
+"""Times ftol: tests that vanish, where a Jacobian is too small for a short step."""
 
 
 def solve(
@@ -46,18 +55,38 @@ def solve(
     side: int,
     known: RootResult | None = None,
     *,
-    last_step_free: bool = False,
+    near: float | None = None,
 ) -> RootResult:
-    """Find the root of the null tests, from one nearby or a round galaxy at its first centroid."""
-    centre = starting_centroid(
-        tests.grid,
-        tests.galaxies,
-        wide_weight(job.weight, tests.grid, side),
-        job.length,
-        reach=0.5 * side,
+    """Find the root of the null tests, from one nearby or a round galaxy at its first centroid.
+
+    Parameters
+    ----------
+    side : int
+        Of the stamps, pixels.
+    known, near
+        As for `search`.
+    """
+    xp = array_namespace(kmax=job.weight.kmax)
+    # A host read: where all are known, nothing else is asked for.
+    if known is not None and bool(xp.all(known.success)):
+        start = known.x
+    else:
+        wide = wide_weight(job.weight, tests.grid, side)
+        centre = starting_centroid(tests.grid, tests.galaxies, wide, job.length, reach=0.5 * side)
+        start = round_start(centre, job.length)
+    return search(tests, start, known, max_iter=job.max_iter, near=near)
+
+
+def rough_root(job: Job, tests: NullTests, side: int) -> RootResult | None:
+    """Return the roots under a weight that ends early: cheap, and next to those that are wanted."""
+    if job.rough is None:
+        return None
+    n_k = tests.grid.n_inside(job.rough_kmax)
+    rough = replace(
+        tests, grid=tests.grid.inner(n_k), galaxies=tests.galaxies.inner(n_k), weight=job.rough
     )
-    start = round_start(centre, job.length)
-    return search(tests, start, known, max_iter=job.max_iter, last_step_free=last_step_free)
+    few = replace(job, weight=job.rough, max_iter=min(job.max_iter, _ROUGH_STEPS))
+    return stepped(solve(few, rough, side, near=_ROUGH_TESTS), _LONGEST_ROUGH)
 
 
 def round_start(centroid: Array, length: float) -> Array:
@@ -72,7 +101,7 @@ def search(
     known: RootResult | None = None,
     *,
     max_iter: int,
-    last_step_free: bool = False,
+    near: float | None = None,
 ) -> RootResult:
     """Find the root of null tests in `(eta1, eta2, x0/L, y0/L)`.
 
@@ -81,37 +110,55 @@ def search(
     tests : RootProblem
     start : array, shape (n_gal, 4)
     known : RootResult, optional
-        Roots of a coarser grid: where they are, the search starts there.
+        Roots nearby, of a coarser grid or a rougher weight: where they are, the search starts
+        there.
     max_iter : int
         Steps.
-    last_step_free : bool
-        Takes the last Newton step without an evaluation; see `looked_at`.
+    near : float, optional
+        What the tests may be at the end of the search; by default they vanish.
     """
     xp = array_namespace(start=start)
     if known is not None:
         start = xp.where(known.success[:, None], known.x, start)
-    ftol = default_ftol(xp, start.dtype)
-    if last_step_free:
-        ftol = _NEAR * math.sqrt(ftol)
     options = DoglegOptions(
-        ftol=ftol, max_iter=max_iter, initial_radius=1.0, max_radius=3.0, patience=_PATIENCE
+        ftol=near, max_iter=max_iter, initial_radius=1.0, max_radius=3.0, patience=_PATIENCE
     )
-    root = find_root(tests, start, options=options)
-    if not last_step_free:
-        return root
+    return find_root(tests, start, options=options)
+
+
+def one_step_off(like: Array) -> float:
+    """Return the tests from which one Newton step makes them vanish, in the precision of `like`."""
+    return _NEAR * math.sqrt(default_ftol(array_namespace(like=like), like.dtype))
+
+
+def stepped(root: RootResult, longest: float = _LONGEST) -> RootResult:
+    """Return roots one Newton step further on, where that is short; the tests are not looked at."""
+    xp = array_namespace(x=root.x)
     step, _ = newton_step(xp, root.f, root.jac)
-    short = root.success & (xp.max(xp.abs(step), axis=-1) <= _LONGEST)
+    short = root.success & (xp.max(xp.abs(step), axis=-1) <= longest)
     return replace(root, x=xp.where(short[:, None], root.x + step, root.x))
 
 
 def looked_at(root: RootResult, f: Array, jac: Array) -> RootResult:
-    """Return the roots with the tests evaluated there; those where they do not vanish failed."""
+    """Return the roots one more step on, from tests and Jacobian evaluated there.
+
+    What the step leaves is about the square of what it takes off. Where that is much, and the
+    tests do not vanish as they are, there is no success.
+    """
     xp = array_namespace(x=root.x)
-    ftol = _ROUNDING * default_ftol(xp, root.x.dtype)
+    ftol = default_ftol(xp, root.x.dtype)
+    step, _ = newton_step(xp, f, jac)
+    off, length = xp.max(xp.abs(f), axis=-1), xp.max(xp.abs(step), axis=-1)
+    short = xp.maximum(off, length) <= max(_LAST_STEP, 3.0 * math.sqrt(ftol))
     # Not `>`: the tests may be NaN.
-    missed = root.success & ~(xp.max(xp.abs(f), axis=-1) <= ftol)
-    status = xp.where(missed, xp.full_like(root.status, int(Status.MAX_ITER)), root.status)
-    return replace(root, f=f, jac=jac, status=status)
+    missed = root.success & ~(short | (off <= _ROUNDING * ftol))
+    return replace(
+        root,
+        x=xp.where((root.success & short)[:, None], root.x + step, root.x),
+        f=f,
+        jac=jac,
+        status=xp.where(missed, xp.full_like(root.status, int(Status.MAX_ITER)), root.status),
+    )
 
 
 def squeezed(eta: Array, frame: Array | None) -> Array:
