@@ -125,6 +125,21 @@ def assert_same(result, expected, rtol=1e-9):
         np.testing.assert_allclose(one, other, rtol=rtol, atol=rtol, err_msg=name)
 
 
+def assert_found_alike(result, expected):
+    """One root, found by two searches; the rest is that of a point 1e-6 or so off it."""
+    for name, rtol, atol in (
+        ("eta", 1e-8, 1e-9),
+        ("centroid", 1e-8, 0.0),
+        ("eg", 0.0, 1e-5),
+        ("eta_cov", 1e-5, 1e-13),
+        ("size", 1e-5, 0.0),
+        ("flux", 1e-5, 0.0),
+        ("snr", 1e-5, 0.0),
+    ):
+        one, other = getattr(result, name), getattr(expected, name)
+        np.testing.assert_allclose(one, other, rtol=rtol, atol=atol, err_msg=name)
+
+
 # --- one exposure ---------------------------------------------------------------------
 
 
@@ -142,9 +157,7 @@ def test_one_exposure_is_measure_shapes(noise):
     psf = fx.Psf.from_image(star())
     alone = fx.measure_shapes(stamps, psf, **options)
     shapes = fx.measure_exposures(stamps, psf, object_index=np.arange(4), **options)
-    for name in ("eta", "eta_cov", "eg", "centroid", "size", "flux", "snr"):
-        one, other = getattr(shapes, name), getattr(alone, name)
-        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-11, err_msg=name)
+    assert_found_alike(shapes, alone)
     assert names(shapes.flags) == names(alone.flags)
     assert names(alone.flags)[3] == ["FINE_GRID"]
     np.testing.assert_allclose(shapes.sky_offset, alone.centroid - 23.5, atol=1e-9)
@@ -158,9 +171,7 @@ def test_one_exposure_on_the_sky_is_measure_shapes(drawn):
         noise_variance=NOISE,
     )
     shapes = drawn.measured(object_index=np.arange(16))
-    for name in ("eta", "eta_cov", "eg", "centroid", "size", "flux", "snr"):
-        one, other = getattr(shapes, name), getattr(alone, name)
-        np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-9, err_msg=name)
+    assert_found_alike(shapes, alone)
 
 
 # --- the truth ------------------------------------------------------------------------
