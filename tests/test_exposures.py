@@ -131,7 +131,7 @@ def assert_found_alike(result, expected):
         ("eta", 1e-8, 1e-9),
         ("centroid", 1e-8, 0.0),
         ("eg", 0.0, 1e-5),
-        ("eta_cov", 1e-5, 1e-13),
+        ("eta_cov", 1e-4, 1e-13),
         ("size", 1e-5, 0.0),
         ("flux", 1e-5, 0.0),
         ("snr", 1e-5, 0.0),
