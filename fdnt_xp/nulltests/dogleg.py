@@ -23,7 +23,15 @@ from fdnt_xp.arrays import (
     require_dtype,
 )
 from fdnt_xp.errors import FdntValueError, RangeError, ShapeMismatchError
-from fdnt_xp.nulltests.small_systems import add_up, largest, newton_step, nonzero, norm, scale_of
+from fdnt_xp.nulltests.small_systems import (
+    add_up,
+    all_of,
+    largest,
+    newton_step,
+    nonzero,
+    norm,
+    scale_of,
+)
 
 # Nocedal & Wright 2006, algorithm 4.1, for the ratio of the real to the promised reduction
 # of the merit; they leave _ACCEPT free in [0, 1/4).
@@ -303,7 +311,7 @@ def _step(
     radius = xp.where(grows, grown, radius)
     radius = xp.where(real < _SHRINK_BELOW * promised, _SHRINK * length, radius)
     radius = xp.where(inside, radius, _SHRINK_OUTSIDE * length)
-    still = xp.all(xp.abs(step) <= eps * xp.abs(state.x), axis=-1)
+    still = all_of(xp, xp.abs(step) <= eps * xp.abs(state.x))
     stalled = inside & (still | (promised <= _FLAT * eps))
     slow = ~(accept & (real >= _SLOW))
     n_slow = xp.where(slow, state.n_slow + 1, xp.zeros_like(state.n_slow))
@@ -350,7 +358,7 @@ def _cauchy_step(xp: ModuleType, f: Array, jac: Array, radius: Array) -> Array:
     """Return the minimum of `|f + J p|` along `-Jᵀ f`, cut at the radius."""
     # p = -(|g|/|J u|²) u, g = Jᵀ f, u = g/|g|; f and J scaled, lest squares over- or underflow.
     size_f = nonzero(xp, largest(xp, f))
-    size_j = scale_of(xp, xp.max(largest(xp, jac), axis=-1), size_f)
+    size_j = scale_of(xp, largest(xp, largest(xp, jac)), size_f)
     jac = jac / size_j[:, None, None]
     gradient = add_up(xp, jac * (f / size_f[:, None])[:, :, None], axis=1)
     slope = norm(xp, gradient)
@@ -379,7 +387,8 @@ def _evaluate(xp: ModuleType, problem: RootProblem, x: Array) -> tuple[Array, Ar
     shapes, expected = (tuple(f.shape), tuple(jac.shape)), ((n, d), (n, d, d))
     if shapes != expected:
         raise ShapeMismatchError(f"problem.evaluate returned {shapes}, expected {expected}")
-    return f, jac, xp.all(xp.isfinite(f), axis=-1) & xp.all(xp.isfinite(jac), axis=(-2, -1))
+    finite = xp.isfinite(largest(xp, f)) & xp.isfinite(largest(xp, largest(xp, jac)))
+    return f, jac, finite
 
 
 def _reduction(xp: ModuleType, f: Array, new: Array) -> Array:

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from fdnt_xp.arrays import Array, array_namespace, device_of
-from fdnt_xp.nulltests.small_systems import newton_step
+from fdnt_xp.arrays import Array, array_namespace
+from fdnt_xp.nulltests.small_systems import inverse
 from fdnt_xp.peers.batch import Fitted, in_domain
 from fdnt_xp.peers.drawing import Drawing
 from fdnt_xp.peers.levenberg import find_minimum, inverse_of_normal
@@ -257,13 +257,8 @@ def fit_images(problem: ImageFit, start: float, max_iter: int) -> Fitted:
 def _inverse(h: Array) -> tuple[Array, Array]:
     """Return the inverse of H, and where it has one and is a minimum's."""
     xp = array_namespace(h=h)
-    columns, regular = [], xp.all(xp.linalg.diagonal(h) > 0, axis=-1)
-    for j in range(5):
-        unit = xp.broadcast_to(xp.eye(5, dtype=h.dtype, device=device_of(h))[j, :], h.shape[:2])
-        column, solved = newton_step(xp, -unit, h)  # of H p = unit
-        columns.append(column)
-        regular = regular & solved
-    return xp.stack(columns, axis=-1), regular
+    result, regular = inverse(xp, h)
+    return result, regular & xp.all(xp.linalg.diagonal(h) > 0, axis=-1)
 
 
 def _products(a: Array, b: Array) -> Array:

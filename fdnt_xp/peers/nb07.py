@@ -28,7 +28,7 @@ from fdnt_xp.arrays import Array, array_namespace, device_of
 from fdnt_xp.fourier.psf import Psf
 from fdnt_xp.nulltests.dogleg import DoglegOptions, Status, find_root
 from fdnt_xp.nulltests.scaled import inverse_if_positive
-from fdnt_xp.nulltests.small_systems import newton_step
+from fdnt_xp.nulltests.small_systems import inverse
 from fdnt_xp.peers.batch import Fitted, Weighted, in_domain, measure_in_chunks, shapes_of
 from fdnt_xp.peers.circular import CIRCULAR_METHODS
 from fdnt_xp.peers.drawing import Drawing
@@ -272,17 +272,12 @@ def _covariance(jac: Array, fit: LinearFit) -> tuple[Array, Array]:
     """
     xp = array_namespace(jac=jac)
     b00 = fit.coefficients[:, 0]
-    unit = xp.eye(4, dtype=jac.dtype, device=device_of(jac))
-    columns, regular = [], b00 > 0
-    for j in range(4):
-        column, solved = newton_step(xp, -xp.broadcast_to(unit[j, :], jac.shape[:2]), jac)
-        columns.append(column[:, 2:])
-        regular = regular & solved
-    to_eta = xp.stack(columns, axis=-1)
+    inverse_jac, regular = inverse(xp, jac)
+    to_eta = inverse_jac[:, 2:, :]
     rows = [xp.stack([fit.covariance[:, i, j] for j in _TESTS], axis=-1) for i in _TESTS]
     square = xp.where(b00 > 0, b00, xp.ones_like(b00)) ** 2
     tests = xp.stack(rows, axis=1) / square[:, None, None]
-    return xp.matmul(xp.matmul(to_eta, tests), xp.matrix_transpose(to_eta)), regular
+    return xp.matmul(xp.matmul(to_eta, tests), xp.matrix_transpose(to_eta)), regular & (b00 > 0)
 
 
 @lru_cache

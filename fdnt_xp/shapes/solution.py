@@ -10,7 +10,7 @@ from fdnt_xp.arrays import Array, array_namespace, device_of, has_any
 from fdnt_xp.flags import FAILED, Flag
 from fdnt_xp.nulltests.dogleg import RootResult, Status
 from fdnt_xp.nulltests.gradient import ellipticity_gradient
-from fdnt_xp.nulltests.small_systems import newton_step
+from fdnt_xp.nulltests.small_systems import inverse
 from fdnt_xp.nulltests.tests import NullTests
 from fdnt_xp.nulltests.values import MatchedWidth, TestNoise, TestValues
 from fdnt_xp.shapes.results import ShapeResult
@@ -238,19 +238,12 @@ def _eta_covariance(
     t0 does not matter.
     """
     xp = array_namespace(x=root.x)
-    inverse, regular = [], root.success
-    units = xp.eye(4, dtype=root.f.dtype, device=device_of(root.f))
-    for j in range(4):
-        unit = xp.broadcast_to(units[j, :], root.f.shape)
-        solution, solved = newton_step(xp, -unit, root.jac)  # of J p = unit
-        inverse.append(solution)
-        regular = regular & solved
-    # Rows 0 and 1 of J⁻¹, column by column.
-    to_eta = xp.stack(inverse, axis=-1)[:, :2, :]
+    inverse_jac, regular = inverse(xp, root.jac)
+    to_eta = inverse_jac[:, :2, :]
     scale = noise.tests.values[:, 4]
     safe = xp.where(scale > 0, scale, xp.ones_like(scale))[:, None, None]
     to_eta = xp.concat([to_eta[:, :, :2], to_eta[:, :, 2:] / tests.length], axis=-1) / safe
-    return sandwich(to_eta, noise.covariance), regular
+    return sandwich(to_eta, noise.covariance), regular & root.success
 
 
 def sandwich(a: Array, c: Array) -> Array:
