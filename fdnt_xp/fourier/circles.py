@@ -11,11 +11,11 @@ import math
 
 import numpy as np
 
-from fdnt_xp.arrays import Array, array_namespace, device_of, works_in_blocks
+from fdnt_xp.arrays import Array, array_namespace, device_of, to_numpy, works_in_blocks
 from fdnt_xp.fourier.interpolation import CubicTable, cubic_table
 from fdnt_xp.fourier.jacobian import longest_stretch
 
-_SCAN_RADII, _SCAN_ANGLES = 48, 12
+_SCAN_RADII, _SCAN_ANGLES = 48, 6
 """Circles on which the end of 𝒯 is looked for, and points on half of each."""
 _TABLE_NODES, _TABLE_ANGLES = 97, 24
 """Nodes of the table of 𝒯. The mean over the angle need not be exact: any isotropic weight
@@ -41,9 +41,8 @@ def circle_tables(
     xp = array_namespace(image=image)
     n_psf = int(image.shape[0])
     parts = []
-    at_once = _PSFS_IN_CACHE if works_in_blocks(image) else _PSFS_AT_ONCE
-    for start in range(0, max(n_psf, 1), at_once):
-        rows = slice(start, min(start + at_once, n_psf))
+    for start in range(0, max(n_psf, 1), _PSFS_AT_ONCE):
+        rows = slice(start, min(start + _PSFS_AT_ONCE, n_psf))
         some = None if unit is None else unit[rows, :, :]
         parts.append(_circularise(image[rows, :, :], oversampling, floor, some))
     kmax, power, ln_power = (xp.concat(part) for part in zip(*parts, strict=True))
@@ -80,12 +79,65 @@ def _circularise(
         scan = scan / longest_stretch(unit)[:, None]
     scanned = power_on_circles(image, scan, _SCAN_ANGLES, oversampling, unit)
     kmax = _first_crossing(scan, _mean(scanned), floor)
-    t = xp.linspace(0.0, 1.0, _TABLE_NODES, **like)[None, :]
-    every = power_on_circles(image, kmax[:, None] * t, _TABLE_ANGLES, oversampling, unit)
+    t = xp.linspace(0.0, 1.0, _TABLE_NODES, **like)
+    every = _on_own_circles(image, kmax, scan[:, -1], t, oversampling, unit)
     power, on_circles = _mean(every), every[:, :: (_TABLE_NODES - 1) // (CIRCLES - 1), :]
     # Where a PSF is dark there is no logarithm; the weight ends before.
     least = xp.full_like(on_circles, float(xp.finfo(image.dtype).smallest_normal))
-    return kmax, _ended_smoothly(power, t), xp.log(xp.maximum(on_circles, least))
+    return kmax, _ended_smoothly(power, t[None, :]), xp.log(xp.maximum(on_circles, least))
+
+
+def _on_own_circles(
+    image: Array, kmax: Array, reach: Array, t: Array, oversampling: float, unit: Array | None
+) -> Array:
+    """Return `|T|²` on the circles `kmax t`, interpolated from circles that PSFs share.
+
+    Most of the sums over a star are the waves, which on shared circles are made once. These end
+    at the next of `reach 2^(-i/2)`: where, and so the result, depends on no other PSF.
+
+    Parameters
+    ----------
+    reach : array, shape (n or 1,)
+        Radius of the largest circle on the grid.
+    """
+    xp = array_namespace(image=image)
+    steps = xp.floor(2.0 * xp.log2(reach / kmax))
+    ends = reach * 2.0 ** (-0.5 * steps)
+    # A host read: how many PSFs share circles decides the size of their batch.
+    classes = to_numpy(steps) if unit is None else np.zeros(image.shape[0])
+    parts, places = [], []
+    for one in np.unique(classes) if classes.size else [0.0]:
+        place = np.flatnonzero(classes == one)
+        rows = xp.asarray(place, dtype=xp.int64, device=device_of(image))
+        some, end, own = (xp.take(column, rows, axis=0) for column in (image, ends, kmax))
+        frame = None if unit is None else xp.take(unit, rows, axis=0)
+        radii = end[:, None] * t
+        radii = radii[:1, :] if unit is None and len(place) > 0 else radii
+        re, im = _on_circles(some, radii, _TABLE_ANGLES, oversampling, frame)
+        nodes = (own / end)[:, None] * t
+        parts.append(_between(re, nodes) ** 2 + _between(im, nodes) ** 2)
+        places.append(rows)
+    return xp.take(xp.concat(parts), xp.argsort(xp.concat(places)), axis=0)
+
+
+def _between(values: Array, nodes: Array) -> Array:
+    """Return values on circles at other radii.
+
+    Parameters
+    ----------
+    values : array, shape (n, n_node, n_angle)
+        On circles of equidistant radii.
+    nodes : array, shape (n, n_node)
+        In units of the largest of them.
+    """
+    xp = array_namespace(values=values)
+    n, n_node, n_angle = (int(length) for length in values.shape)
+    rays = (n * n_angle, n_node)
+    table = cubic_table(xp.reshape(xp.matrix_transpose(values), rays))
+    wanted = xp.reshape(xp.broadcast_to(nodes[:, None, :], (n, n_angle, n_node)), rays)
+    row = xp.arange(n * n_angle, dtype=xp.int64, device=device_of(values))
+    found = table.evaluate(wanted, row)[0]
+    return xp.matrix_transpose(xp.reshape(found, (n, n_angle, n_node)))
 
 
 def _mean(power: Array) -> Array:
@@ -116,37 +168,89 @@ def power_on_circles(
     unit : array, shape (n or 1, 2, 2), optional
         B, where the circles are those of the sky: `k = Bᵀ k_sky`.
     """
+    re, im = _on_circles(image, radii, n_angle, oversampling, unit)
+    return re**2 + im**2
+
+
+def _on_circles(
+    image: Array, radii: Array, n_angle: int, oversampling: float, unit: Array | None
+) -> tuple[Array, Array]:
+    """Return `Re T` and `Im T`; parameters and shapes are those of `power_on_circles`."""
     xp = array_namespace(image=image)
-    ny, nx = image.shape[1:]
+    ny, nx = (int(length) for length in image.shape[1:])
     angle = np.pi * (np.arange(n_angle) + 0.5) / n_angle
     like = {"dtype": image.dtype, "device": device_of(image)}
     cos, sin = (xp.asarray(f(angle), **like) for f in (np.cos, np.sin))
-    n_radius = int(radii.shape[1])
-    points = (int(radii.shape[0]), n_radius * n_angle)
-    kx = xp.reshape(radii[:, :, None] * cos, points)
-    ky = xp.reshape(radii[:, :, None] * sin, points)
+    n, n_radius = int(image.shape[0]), int(radii.shape[1])
+    shared = int(radii.shape[0]) == 1 and unit is None
+    at_once = _PSFS_IN_CACHE if works_in_blocks(image) else max(n, 1)
+    waves, parts = None, []
+    for start in range(0, max(n, 1), at_once):
+        rows = slice(start, min(start + at_once, n))
+        if waves is None or not shared:
+            some = radii if shared else radii[rows, :]
+            frame = None if unit is None else unit[rows, :, :]
+            waves = _waves_on(some, cos, sin, (ny, nx), oversampling, frame)
+        (cos_x, sin_x), (cos_y, sin_y) = waves
+        # Even and odd in x and y: a wave meets a quarter of the pixels instead of all.
+        (even, odd), (odd_y, odd_xy) = (
+            _even_and_odd(part, axis=2) for part in _even_and_odd(image[rows, :, :], axis=1)
+        )
+        re = xp.matmul(even, cos_x) * cos_y - xp.matmul(odd_xy, sin_x) * sin_y
+        im = xp.matmul(odd, sin_x) * cos_y + xp.matmul(odd_y, cos_x) * sin_y
+        parts.append((xp.sum(re, axis=1), xp.sum(im, axis=1)))
+    re, im = (xp.concat(part) for part in zip(*parts, strict=True))
+    shape = (n, n_radius, n_angle)
+    return xp.reshape(re, shape), xp.reshape(im, shape)
+
+
+def _waves_on(
+    radii: Array,
+    cos: Array,
+    sin: Array,
+    shape: tuple[int, int],
+    oversampling: float,
+    unit: Array | None,
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Return the waves along x and along y of the points of circles: see `_waves_at`."""
+    xp = array_namespace(radii=radii)
+    ny, nx = shape
+    n_point = int(radii.shape[1]) * int(cos.shape[0])
+    kx, ky = (xp.reshape(radii[:, :, None] * f, (-1, n_point)) for f in (cos, sin))
     if unit is not None:
         kx, ky = (unit[:, 0, j : j + 1] * kx + unit[:, 1, j : j + 1] * ky for j in (0, 1))
-    cos_x, sin_x = _waves_at(kx, nx, oversampling)
-    cos_y, sin_y = _waves_at(ky, ny, oversampling)
-    cos_sum, sin_sum = xp.matmul(image, cos_x), xp.matmul(image, sin_x)
-    re = xp.sum(cos_sum * cos_y - sin_sum * sin_y, axis=1)
-    im = xp.sum(cos_sum * sin_y + sin_sum * cos_y, axis=1)
-    return xp.reshape(re**2 + im**2, (-1, n_radius, n_angle))
+    return _waves_at(kx, nx, oversampling), _waves_at(ky, ny, oversampling)
+
+
+def _even_and_odd(image: Array, axis: int) -> tuple[Array, Array]:
+    """Return `I(x) + I(-x)` and `I(x) - I(-x)` of the pixels with x >= 0, the first at 0 or ½."""
+    xp = array_namespace(image=image)
+    n = int(image.shape[axis])
+    half = [slice(None)] * image.ndim
+    half[axis] = slice(n // 2, n)
+    right, left = image[tuple(half)], xp.flip(image, axis=axis)[tuple(half)]
+    even = right + left
+    if n % 2 == 1:
+        # The middle is its own mirror image, and counts once.
+        x = xp.arange(n - n // 2, dtype=image.dtype, device=device_of(image))
+        share = xp.where(x > 0, xp.ones_like(x), 0.5 * xp.ones_like(x))
+        even = even * (share[None, :, None] if axis == 1 else share)
+    return even, right - left
 
 
 def _waves_at(k: Array, n: int, oversampling: float) -> tuple[Array, Array]:
-    """Return `cos k x` and `sin k x` of n pixels, shape (n_psf, n, n_point).
+    """Return `cos k x` and `sin k x` of the pixels of n with x >= 0, (n_psf, -(-n//2), n_point).
 
     A wave over all pixels is the product of one over blocks of them and one over the pixels of
     a block: about `2 sqrt(n)` cosines instead of n.
     """
     xp = array_namespace(k=k)
+    first, n = 0.5 * (n % 2 == 0), n - n // 2
     n_block = math.isqrt(n)
     n_pixel = -(-n // n_block)
     like = {"dtype": k.dtype, "device": device_of(k)}
-    first = (xp.arange(n_block, **like) * n_pixel - 0.5 * (n - 1)) / oversampling
-    block = k[:, None, :] * first[None, :, None]
+    blocks = (xp.arange(n_block, **like) * n_pixel + first) / oversampling
+    block = k[:, None, :] * blocks[None, :, None]
     pixel = k[:, None, :] * (xp.arange(n_pixel, **like) / oversampling)[None, :, None]
     cos_b, sin_b = (f(block)[:, :, None, :] for f in (xp.cos, xp.sin))
     cos_p, sin_p = (f(pixel)[:, None, :, :] for f in (xp.cos, xp.sin))

@@ -94,9 +94,11 @@ def starting_centroid(
     xp = array_namespace(weight=weight)
     # A host read: a wide weight is narrow in k, and its modes are few.
     number = xp.arange(grid.n_k, dtype=xp.int64, device=device_of(weight))
-    n_k = 1 + int(xp.max(xp.where(weight > _LEAST_WEIGHT, number, xp.zeros_like(number))))
-    grid, galaxies, weight = grid.inner(n_k), galaxies.inner(n_k), weight[:, :n_k]
-    problem = DipoleTests(grid=grid, galaxies=galaxies, weight=weight, length=length)
+    seen = xp.any(weight > _LEAST_WEIGHT, axis=0)
+    n_k = 1 + int(xp.max(xp.where(seen, number, xp.zeros_like(number))))
+    problem = DipoleTests(
+        grid=grid.inner(n_k), galaxies=galaxies.inner(n_k), weight=weight[:, :n_k], length=length
+    )
     return find_centroid(problem, galaxies.re[:, :2], length, reach=reach)
 
 

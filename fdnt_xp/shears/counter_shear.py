@@ -11,10 +11,10 @@ stays where the PSF has left information.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Final, Protocol
 
-from fdnt_xp.arrays import Array, array_namespace, device_of
+from fdnt_xp.arrays import Array, array_namespace, blocks_in_cache, device_of
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.sky_grid import SkyGrid
 from fdnt_xp.fourier.transform import DeconvolvedStamps
@@ -22,12 +22,14 @@ from fdnt_xp.nulltests.dogleg import DoglegOptions, find_root
 from fdnt_xp.nulltests.tests import NullTests
 from fdnt_xp.nulltests.weights import Weight
 from fdnt_xp.shapes.centroid import DipoleTests
+from fdnt_xp.shapes.search import one_step_off, search, stepped
 from fdnt_xp.shears.cuts import FrameQuantities
 from fdnt_xp.shears.weights import ShapeWeight
 
-_OPTIONS: Final = DoglegOptions(max_iter=30, initial_radius=1.0, max_radius=3.0)
-"""Radii in `|eta|` and in the length unit of centroids."""
-_CENTROID_OPTIONS: Final = DoglegOptions(ftol=1e-4, max_iter=30, initial_radius=1.0, max_radius=3.0)
+_MAX_ITER: Final = 30
+_CENTROID_OPTIONS: Final = DoglegOptions(
+    ftol=1e-4, max_iter=_MAX_ITER, initial_radius=1.0, max_radius=3.0
+)
 """A last step of Newton's, taken on the moments alone, squares what ftol leaves."""
 
 
@@ -207,6 +209,28 @@ def moments_at(
 ) -> FrameMoments:
     """Return the moments at the root of the dipole that is next to `centroid` (pixels)."""
     xp = array_namespace(centroid=centroid)
+    shared = int(window.shape[0]) == 1
+    parts = [
+        _moments_near(
+            grid.take(rows),
+            galaxies.take(rows),
+            window if shared else window[rows, :],
+            centroid[rows, :],
+        )
+        for rows in blocks_in_cache(galaxies.re)
+    ]
+    columns = {
+        column.name: xp.concat([getattr(part, column.name) for part in parts], axis=0)
+        for column in fields(FrameMoments)
+    }
+    return FrameMoments(**columns)
+
+
+def _moments_near(
+    grid: KGrid, galaxies: DeconvolvedStamps, window: Array, centroid: Array
+) -> FrameMoments:
+    """Return the moments of few galaxies."""
+    xp = array_namespace(centroid=centroid)
     re, im = galaxies.shifted(grid, centroid)
     flux, xx, xy, yy = _split(grid.moments(window * re, 0, 2))
     (x, y), (xxx, xxy, xyy, yyy) = (_split(m) for m in grid.odd_moments(window * im))
@@ -347,7 +371,8 @@ class SolvedEta:
             length=self.length,
             fixed_width=None if self.size is None else xp.full_like(column, self.size**2),
         )
-        root = find_root(tests, start, options=_OPTIONS)
+        near = one_step_off(start)
+        root = stepped(search(tests, start, max_iter=_MAX_ITER, near=near))
         if plain is not grid:
             root = replace(root, x=in_new_frame(root.x, plain, grid))
             start = in_new_frame(start, plain, grid)

@@ -21,7 +21,7 @@ from fdnt_xp.fourier.transform import DeconvolvedStamps, deconvolve
 from fdnt_xp.nulltests.weights import Weight
 from fdnt_xp.shapes.centroid import starting_centroid, wide_weight
 from fdnt_xp.shapes.job import Chunk, Job, in_order, screen
-from fdnt_xp.shear import shear_matrix
+from fdnt_xp.shear import eta_from_matrix, shear_matrix
 from fdnt_xp.shears.counter_shear import FrameNoise, FrameValues, Statistic, in_new_frame
 from fdnt_xp.shears.cuts import QUANTITIES, FrameQuantities
 from fdnt_xp.shears.masks import SampleMask
@@ -175,6 +175,7 @@ class FrameSample:
             sheared, weight = self._in_frame(job, gamma)
             old = grid if frame is None else self._in_frame(job, frame)[0]
             start = in_new_frame(start, old, sheared)
+            start = self._counter_sheared(start, frame, gamma)
             seen, frame_noise = galaxies, None
             if noise is not None and optics.noise is not None:
                 power = optics.noise.power
@@ -201,6 +202,22 @@ class FrameSample:
             return job.coarse.sheared(shear), weight
         matrix = xp.matmul(shear_matrix(shear)[None, :, :], weight.frame)
         return SkyGrid.of(job.coarse, matrix), replace(weight, frame=matrix)
+
+    def _counter_sheared(self, solution: Array, old: Gamma | None, new: Gamma) -> Array:
+        """Return solutions with their shapes as those of frame `old` look in another.
+
+        But for the ellipticity gradient that is what the search will find there.
+        """
+        if self.statistic.n_unknown == 2:
+            return solution
+        xp = array_namespace(solution=solution)
+        by_old, by_new = (
+            shear_matrix(xp.asarray(gamma, dtype=solution.dtype, device=device_of(solution)))
+            for gamma in (old or (0.0, 0.0), (-new[0], -new[1]))
+        )
+        change = xp.matmul(by_new, by_old)[None, :, :]
+        eta = eta_from_matrix(xp.matmul(change, shear_matrix(solution[:, :2])))
+        return xp.concat([eta, solution[:, 2:]], axis=-1)
 
     def _screened(self, chunk: Chunk, job: Job) -> tuple[Array, Array]:
         """Return stamps that do no harm, their gaps filled, and what is to be said of them.

@@ -24,6 +24,8 @@ StatisticName: TypeAlias = Literal["frozen", "eta"]
 _PER_PSF: Final = 1.5
 """Size of the frozen weight, where the galaxies are not looked at, in lengths of about the
 size of the PSF."""
+_MORE_FIELDS: Final = 6
+"""Arrays of the size of the transforms that a frame holds besides: noise, and galaxies with it."""
 _PER_GALAXY: Final = 1.15
 """The same in sizes of a typical galaxy, as seen under that weight. The error of the shear is
 within 1 % of its least for exponential and de Vaucouleurs galaxies from half to one and a half
@@ -107,7 +109,8 @@ def make_sample(
                 farthest=0.5 * min(int(n) for n in stamps.shape[1:]),
             ),
             reach=math.sqrt((1.0 + max_shear) / (1.0 - max_shear)),
-            chunk_size=chunk_size or galaxies_at_once(job.coarse, stamps),
+            chunk_size=chunk_size
+            or galaxies_at_once(job.coarse, stamps, _MORE_FIELDS * job.coarse.n_k, only_tests=True),
             noise=sample_noise,
             # On the image the weight is convolved with something as wide as the PSF.
             mask=SampleMask.of(xp, stamps, mask, masked, math.hypot(frozen, job.length)),
