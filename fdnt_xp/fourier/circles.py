@@ -178,10 +178,14 @@ def _on_circles(
     """Return `Re T` and `Im T`; parameters and shapes are those of `power_on_circles`."""
     xp = array_namespace(image=image)
     ny, nx = (int(length) for length in image.shape[1:])
-    angle = np.pi * (np.arange(n_angle) + 0.5) / n_angle
+    # From the sums at (kx, ky) those at (-kx, ky) follow, which is half of all where the circles
+    # are those of the pixels.
+    mirrored = unit is None and n_angle % 2 == 0
+    n_point = n_angle // 2 if mirrored else n_angle
+    angle = np.pi * (np.arange(n_point) + 0.5) / n_angle
     like = {"dtype": image.dtype, "device": device_of(image)}
     cos, sin = (xp.asarray(f(angle), **like) for f in (np.cos, np.sin))
-    n, n_radius = int(image.shape[0]), int(radii.shape[1])
+    n = int(image.shape[0])
     shared = int(radii.shape[0]) == 1 and unit is None
     at_once = _PSFS_IN_CACHE if works_in_blocks(image) else max(n, 1)
     waves, parts = None, []
@@ -191,17 +195,32 @@ def _on_circles(
             some = radii if shared else radii[rows, :]
             frame = None if unit is None else unit[rows, :, :]
             waves = _waves_on(some, cos, sin, (ny, nx), oversampling, frame)
-        (cos_x, sin_x), (cos_y, sin_y) = waves
-        # Even and odd in x and y: a wave meets a quarter of the pixels instead of all.
-        (even, odd), (odd_y, odd_xy) = (
-            _even_and_odd(part, axis=2) for part in _even_and_odd(image[rows, :, :], axis=1)
-        )
-        re = xp.matmul(even, cos_x) * cos_y - xp.matmul(odd_xy, sin_x) * sin_y
-        im = xp.matmul(odd, sin_x) * cos_y + xp.matmul(odd_y, cos_x) * sin_y
-        parts.append((xp.sum(re, axis=1), xp.sum(im, axis=1)))
-    re, im = (xp.concat(part) for part in zip(*parts, strict=True))
-    shape = (n, n_radius, n_angle)
-    return xp.reshape(re, shape), xp.reshape(im, shape)
+        parts.append(_sums_of_waves(image[rows, :, :], *waves))
+    sums = (xp.concat(part) for part in zip(*parts, strict=True))
+    cc, ss, sc, cs = (xp.reshape(one, (n, int(radii.shape[1]), n_point)) for one in sums)
+    if not mirrored:
+        return cc - ss, sc + cs
+    re = xp.concat([cc - ss, xp.flip(cc + ss, axis=-1)], axis=-1)
+    im = xp.concat([sc + cs, xp.flip(cs - sc, axis=-1)], axis=-1)
+    return re, im
+
+
+def _sums_of_waves(
+    image: Array, along_x: tuple[Array, Array], along_y: tuple[Array, Array]
+) -> tuple[Array, Array, Array, Array]:
+    """Return sums of images times cos cos, sin sin, sin cos and cos sin of `kx x` and `ky y`."""
+    xp = array_namespace(image=image)
+    # Even and odd in x and y: a wave meets a quarter of the pixels instead of all.
+    (even, odd), (odd_y, odd_xy) = (
+        _even_and_odd(part, axis=2) for part in _even_and_odd(image, axis=1)
+    )
+    (cos_x, sin_x), (cos_y, sin_y) = along_x, along_y
+    return (
+        xp.sum(xp.matmul(even, cos_x) * cos_y, axis=1),
+        xp.sum(xp.matmul(odd_xy, sin_x) * sin_y, axis=1),
+        xp.sum(xp.matmul(odd, sin_x) * cos_y, axis=1),
+        xp.sum(xp.matmul(odd_y, cos_x) * sin_y, axis=1),
+    )
 
 
 def _waves_on(
