@@ -15,7 +15,7 @@ from fdnt_xp.arrays import Array, array_namespace, device_of, to_numpy, works_in
 from fdnt_xp.fourier.interpolation import CubicTable, cubic_table
 from fdnt_xp.fourier.jacobian import longest_stretch
 
-_SCAN_RADII, _SCAN_ANGLES = 48, 6
+_SCAN_RADII, _SCAN_ANGLES = 48, 12
 """Circles on which the end of 𝒯 is looked for, and points on half of each."""
 _TABLE_NODES, _TABLE_ANGLES = 97, 24
 """Nodes of the table of 𝒯. The mean over the angle need not be exact: any isotropic weight
