@@ -104,10 +104,11 @@ def _on_own_circles(
     steps = xp.floor(2.0 * xp.log2(reach / kmax))
     ends = reach * 2.0 ** (-0.5 * steps)
     # A host read: how many PSFs share circles decides the size of their batch.
-    classes = to_numpy(steps) if unit is None else np.zeros(image.shape[0])
+    _, group = np.unique(to_numpy(steps), return_inverse=True)
+    group = group if unit is None else np.zeros_like(group)
     parts, places = [], []
-    for one in np.unique(classes) if classes.size else [0.0]:
-        place = np.flatnonzero(classes == one)
+    for number in range(max(group, default=0) + 1):
+        place = np.flatnonzero(group == number)
         rows = xp.asarray(place, dtype=xp.int64, device=device_of(image))
         some, end, own = (xp.take(column, rows, axis=0) for column in (image, ends, kmax))
         frame = None if unit is None else xp.take(unit, rows, axis=0)
