@@ -14,6 +14,7 @@ from fdnt_xp.app.cli import main
 from fdnt_xp.app.psf_check import Verdict, conclusions, plot_verdicts, stamp_size, table_row
 from fdnt_xp.data import noise_bias as noise_bias_module
 from fdnt_xp.data.calibration import Calibration, _calibration, error_calibration
+from fdnt_xp.data.coloured_noise import coloured_stamps
 from fdnt_xp.data.noise_bias import NoiseBias, noise_bias
 from fdnt_xp.data.noise_power import measure_noise_power
 from fdnt_xp.data.own_psf import psf_of_image
@@ -135,6 +136,17 @@ def test_correlated_noise_has_its_spectrum_and_is_told(versions, monkeypatch):
     low = (slice(0, 6), slice(0, 6))
     assert np.mean(measured.power[low]) == pytest.approx(np.mean(told[low]), rel=0.1)
     assert np.all(seen[0].symmetry % 4 == 0)
+
+
+def test_stamps_of_it_know_no_opposite_edge():
+    stamps = coloured_stamps(np.random.default_rng(3), 1000, 2.0 * spectrum())
+    # A lag of one pixel within a stamp, and the same around its edge.
+    near = np.mean(stamps[:, :, 0] * stamps[:, :, 1])
+    around = np.mean(stamps[:, :, 0] * stamps[:, :, -1])
+    assert near > 0.2 * np.mean(stamps**2)
+    assert abs(around) < 0.02 * np.mean(stamps**2)
+    again = measure_noise_power(stamps)
+    np.testing.assert_allclose(again.variance, 2.0 * np.mean(spectrum()), rtol=0.02)
 
 
 def test_the_estimators_take_the_spectrum(versions):

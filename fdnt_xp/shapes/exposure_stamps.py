@@ -86,7 +86,7 @@ class ExposureStamps:
         none = np.flatnonzero(counts == 0)
         return xp.asarray(none, dtype=xp.int64, device=device_of(self.origin))
 
-    def batches(self, n_at_once: int) -> Iterator[ExposureBatch]:
+    def batches(self, n_at_once: int) -> Iterator[ObjectBatch]:
         """Yield all objects with stamps, in batches of equally many stamps each.
 
         `n_at_once` stamps are in work together, more only where one object has more.
@@ -107,7 +107,7 @@ class ExposureStamps:
                     xp.asarray(some, **like), xp.asarray(rows.reshape(-1), **like), n_each
                 )
 
-    def _batch(self, objects: Array, rows: Array, n_each: int) -> ExposureBatch:
+    def _batch(self, objects: Array, rows: Array, n_each: int) -> ObjectBatch:
         xp = array_namespace(rows=rows)
         jacobian, regular = None, xp.ones_like(rows, dtype=xp.bool)
         if self.sky is not None:
@@ -118,7 +118,7 @@ class ExposureStamps:
         flags = xp.where(regular, flags, xp.full_like(flags, int(Flag.BAD_JACOBIAN)))
         origin = xp.take(self.origin, rows, axis=0)
         unit, exposures = _on_sky(origin, jacobian, regular, n_each)
-        return ExposureBatch(
+        return ObjectBatch(
             objects=objects,
             rows=rows,
             unit=unit,
@@ -130,7 +130,7 @@ class ExposureStamps:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExposureBatch:
+class ObjectBatch:
     """Objects with equally many stamps, which are in their order.
 
     Parameters
