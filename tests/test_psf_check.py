@@ -274,6 +274,7 @@ def folder(tmp_path, monkeypatch):
     fits.PrimaryHDU(image(with_pixel(moffat()))).writeto("psf.fits")
     blank = 10.0 * np.random.default_rng(1).standard_normal((6 * SIZE, 6 * SIZE))
     fits.PrimaryHDU(blank).writeto("white.fits")
+    fits.PrimaryHDU(blank + 1000.0).writeto("sky.fits")
     fits.PrimaryHDU(blank + np.roll(blank, 1, axis=1)).writeto("correlated.fits")
     return tmp_path
 
@@ -312,6 +313,7 @@ def test_noise_images(folder):
         ((*SMALL, "--snr", "10,x"), "--snr must be numbers"),
         (("--psf", "none.fits"), "does not exist"),
         ((*SMALL, "--oversampling", -1), "oversampling"),
+        ((*SMALL, "--psf", "sky.fits"), "the PSF is the image of one star"),
     ],
 )
 def test_what_the_command_refuses_is_one_line(folder, arguments, says):

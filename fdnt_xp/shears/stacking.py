@@ -144,7 +144,7 @@ def shear_from_stack(
     weights = xp.astype(galaxy_weights(everyone, galaxy_weight), stamps.dtype)
     centres = _from_the_middle(xp, stamps, centroids)
     regular = None
-    single = jacobian is None or jacobian.ndim == 2
+    single = jacobian is None or getattr(jacobian, "ndim", 2) == 2
     if jacobian is not None and single:
         psf = sky_frame(xp, stamps, n_gal, jacobian).seen_by(psf)
     elif jacobian is not None:
