@@ -173,6 +173,16 @@ def test_every_galaxy_may_have_its_own_pixels(xp, dtype, to_xp, to_np):
     assert np.max(np.abs(to_np(plain.g) - [0.03, -0.02])) > 1e-2
 
 
+def test_pixels_may_be_of_many_sizes():
+    # In the unit of the largest, wave numbers behind the smallest go beyond pi.
+    jacobians = np.stack([(0.7, 1.0, 1.65)[i % 3] * np.eye(2) for i in range(12)])
+    stamps, stars = through_pixels([0.03, -0.02], jacobians)
+    estimate = fx.shear_from_stack(stamps, fx.Psf.from_image(stars), jacobian=jacobians)
+    np.testing.assert_allclose(estimate.g, [0.03, -0.02], atol=1e-5)
+    null = fx.population_null(stamps, fx.Psf.from_image(stars), jacobian=jacobians, statistic="eta")
+    np.testing.assert_allclose(null.g, [0.03, -0.02], atol=1e-5)
+
+
 def test_a_bad_jacobian_is_left_out():
     jacobians = np.stack([np.eye(2)] * 16)
     stamps, stars = through_pixels([0.03, -0.02], jacobians)
@@ -181,6 +191,11 @@ def test_a_bad_jacobian_is_left_out():
         estimate = fx.shear_from_stack(stamps, fx.Psf.from_image(stars), jacobian=jacobians)
     assert (estimate.n_used, estimate.n_excluded) == (14, 2)
     np.testing.assert_allclose(estimate.g, [0.03, -0.02], atol=0.02)
+    # Degrees among arcsec would make one unit of length for all of no use.
+    jacobians = np.stack([np.eye(2)] * 16)
+    jacobians[[0, 8]] /= 3600.0
+    with pytest.warns(FdntWarning, match="2 of 16 stamps left out"):
+        fx.shear_from_stack(stamps, fx.Psf.from_image(stars), jacobian=jacobians)
     jacobians[:] = 0.0
     with pytest.raises(FdntValueError, match="0 usable stamps in 0 groups"):
         fx.shear_from_stack(stamps, fx.Psf.from_image(stars), jacobian=jacobians)

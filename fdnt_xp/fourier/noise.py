@@ -263,7 +263,7 @@ def _ln_polar(psf: Psf, pixels: PixelNoise) -> Array:
     t = xp.linspace(0.0, 1.0, CIRCLES, dtype=psf.kmax.dtype, device=device_of(psf.kmax))
     radii = psf.circle_kmax[:, None] * t[None, :]
     parts = []
-    for first in range(0, psf.n_psf, _PSFS_AT_ONCE):
+    for first in range(0, max(psf.n_psf, 1), _PSFS_AT_ONCE):
         rows = slice(first, min(first + _PSFS_AT_ONCE, psf.n_psf))
         correlation = pixels.take(rows).correlation
         unit = None if psf.unit_jacobian is None else psf.unit_jacobian[rows, :, :]
