@@ -22,7 +22,7 @@ _TABLE_NODES, _TABLE_ANGLES = 97, 24
 gives a valid null test. It must be smooth in k, which it is for any number of angles."""
 CIRCLES, CIRCLE_POINTS = 25, _TABLE_ANGLES
 """Of the table of `|T|²` on circles, every fourth of those, and points on half of each."""
-_PSFS_AT_ONCE, _PSFS_IN_CACHE = 64, 8
+_PSFS_AT_ONCE, _PSFS_IN_CACHE = 64, 2
 """Bounds the memory of the trigonometric sums."""
 
 
@@ -117,22 +117,42 @@ def power_on_circles(
         B, where the circles are those of the sky: `k = Bᵀ k_sky`.
     """
     xp = array_namespace(image=image)
-    ny, nx = image.shape[1:]
-    angle = np.pi * (np.arange(n_angle) + 0.5) / n_angle
+    # From the sums at (kx, ky) those at (-kx, ky) follow, which is half of all where the circles
+    # are those of the pixels.
+    mirrored = unit is None and n_angle % 2 == 0
+    n_point = n_angle // 2 if mirrored else n_angle
+    angle = np.pi * (np.arange(n_point) + 0.5) / n_angle
     like = {"dtype": image.dtype, "device": device_of(image)}
     cos, sin = (xp.asarray(f(angle), **like) for f in (np.cos, np.sin))
     n_radius = int(radii.shape[1])
-    points = (int(radii.shape[0]), n_radius * n_angle)
+    points = (int(radii.shape[0]), n_radius * n_point)
     kx = xp.reshape(radii[:, :, None] * cos, points)
     ky = xp.reshape(radii[:, :, None] * sin, points)
     if unit is not None:
         kx, ky = (unit[:, 0, j : j + 1] * kx + unit[:, 1, j : j + 1] * ky for j in (0, 1))
-    cos_x, sin_x = _waves_at(kx, nx, oversampling)
-    cos_y, sin_y = _waves_at(ky, ny, oversampling)
-    cos_sum, sin_sum = xp.matmul(image, cos_x), xp.matmul(image, sin_x)
-    re = xp.sum(cos_sum * cos_y - sin_sum * sin_y, axis=1)
-    im = xp.sum(cos_sum * sin_y + sin_sum * cos_y, axis=1)
-    return xp.reshape(re**2 + im**2, (-1, n_radius, n_angle))
+    cos_cos, cos_sin, sin_cos, sin_sin = _sums_of_waves(image, kx, ky, oversampling)
+
+    def power(sign: float) -> Array:
+        re, im = cos_cos - sign * sin_sin, cos_sin + sign * sin_cos
+        return xp.reshape(re**2 + im**2, (-1, n_radius, n_point))
+
+    if not mirrored:
+        return power(1.0)
+    return xp.concat([power(1.0), xp.flip(power(-1.0), axis=-1)], axis=-1)
+
+
+def _sums_of_waves(
+    image: Array, kx: Array, ky: Array, oversampling: float
+) -> tuple[Array, Array, Array, Array]:
+    """Return sums of images times cos or sin of kx x, and cos or sin of ky y; (n, n_point)."""
+    xp = array_namespace(image=image)
+    ny, nx = (int(length) for length in image.shape[1:])
+    sums = [xp.matmul(image, waves) for waves in _waves_at(kx, nx, oversampling)]
+    along_y = _waves_at(ky, ny, oversampling)
+    cos_cos, cos_sin, sin_cos, sin_sin = (
+        xp.sum(one * waves, axis=1) for one in sums for waves in along_y
+    )
+    return cos_cos, cos_sin, sin_cos, sin_sin
 
 
 def _waves_at(k: Array, n: int, oversampling: float) -> tuple[Array, Array]:
