@@ -25,6 +25,7 @@ from fdnt_xp.app.summary import summary_lines
 from fdnt_xp.app.trial_commands import bench, check, ring
 from fdnt_xp.app.workers import warn_of_too_many
 from fdnt_xp.data.catalog import read_catalog
+from fdnt_xp.data.model_stars import MODELS
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -36,6 +37,13 @@ def main() -> None:
 @main.command(cls=Command)
 @click.argument("image")
 @click.option("--psf", required=True, metavar="FILE", help="Image of a star, or a cube of them.")
+@click.option(
+    "--psf-model",
+    type=click.Choice(MODELS),
+    default="image",
+    show_default=True,
+    help="What --psf is; a model is drawn at each galaxy.",
+)
 @click.option("--cell", type=int, metavar="N", help="The image is a grid of N x N pixel cells.")
 @click.option("--positions", metavar="TABLE", help="Positions of the galaxies on the image.")
 @click.option("--stamp-size", type=int, metavar="N", help="Pixels on a side, with --positions.")
@@ -100,6 +108,7 @@ def main() -> None:
 def measure(
     image: str,
     psf: str,
+    psf_model: str,
     cell: int | None,
     positions: str | None,
     stamp_size: int | None,
@@ -129,6 +138,7 @@ def measure(
     inputs = Inputs(
         image=image,
         psf=psf,
+        psf_model=psf_model,
         cell=cell,
         positions=positions,
         stamp_size=stamp_size,
