@@ -140,8 +140,14 @@ def as_floating(xp: ModuleType, array: Array, name: str) -> Array:
     """Return `array` as real floating point, in native byte order and positive strides.
 
     Integer and boolean arrays become the library's float64. NumPy arrays of foreign byte
-    order, as FITS readers give them, are swapped. Complex input is refused.
+    order, as FITS readers give them, are swapped. Complex input is refused, and so are masked
+    elements.
     """
+    if isinstance(array, np.ma.MaskedArray) and np.ma.is_masked(array):
+        raise FdntTypeError(
+            f"{name} is a masked array, and its mask would be lost: fill it, and say what is "
+            "missing by an ivar of 0, or by mask"
+        )
     if isinstance(array, np.ndarray):
         array = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("="))
     if xp.isdtype(array.dtype, "complex floating"):

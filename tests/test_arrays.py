@@ -107,6 +107,14 @@ def test_unusual_precisions_become_the_nearest_usual(given, expected):
     assert as_floating(compat_numpy, np.ones(3, dtype=given), "stamps").dtype == expected
 
 
+def test_a_mask_is_not_lost():
+    masked = np.ma.masked_greater(np.arange(4.0), 2.5)
+    with pytest.raises(FdntTypeError, match="stamps is a masked array"):
+        as_floating(compat_numpy, masked, "stamps")
+    nothing = as_floating(compat_numpy, np.ma.masked_greater(np.arange(4.0), 9.0), "stamps")
+    np.testing.assert_array_equal(nothing, np.arange(4.0))
+
+
 # --- devices and the way back --------------------------------------------------------
 
 

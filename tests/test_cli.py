@@ -289,6 +289,15 @@ def test_an_interrupt_leaves_nothing_and_says_so(number, folder, monkeypatch):
     assert sorted(folder.iterdir()) == before
 
 
+def test_no_more_memory_is_one_line(folder, monkeypatch):
+    def no_room(*_, **__):
+        raise MemoryError("Unable to allocate 417. GiB")
+
+    monkeypatch.setattr(measure_run, "measure_rows", no_room)
+    said = run(*GRID, "-o", "catalog.fits", code=1)
+    assert said == "Error: out of memory: Unable to allocate 417. GiB\n"
+
+
 # --- backends ---------------------------------------------------------------------------
 
 

@@ -656,6 +656,8 @@ def test_table(drawn):
         ({"noise_variance": -1.0}, RangeError, "noise_variance"),
         ({"band": np.zeros(16)}, FdntTypeError, "band must hold whole numbers"),
         ({"band": np.zeros((16, 1), dtype=int)}, ShapeMismatchError, "band must have"),
+        ({"band": np.full(16, 10**9)}, RangeError, "band = 1e.09 is outside"),
+        ({"object_index": np.arange(16) + 10**12}, FdntValueError, "it counts objects from 0"),
         ({"transform": "gl"}, FdntValueError, "no transform 'gl'"),
         ({"transform": "hybrid", "order": 99}, FdntError, "order"),
         ({"chunk_size": 0}, RangeError, "chunk_size"),

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import gzip
 from pathlib import Path
 
 import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
-from click.testing import CliRunner
+from damage import damaged, damaged_bytes, refused_or_done
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import fdnt_xp as fx
-from fdnt_xp.app.cli import main
 from fdnt_xp.errors import FdntError
 from fdnt_xp.flags import FAILED
 from images import galaxies, star
@@ -26,29 +24,7 @@ GALAXIES = galaxies(np.array([[0.1, 0.2], [-0.3, 0.0], [0.0, 0.1]]), (SIDE, SIDE
 
 # --- arrays -------------------------------------------------------------------------------
 
-_ODD = st.sampled_from([np.nan, np.inf, -np.inf, 0.0, -1.0, 1e308, -1e308, 1e30, 1e-320])
 _NUMBERS = st.sampled_from([0, -1, 1, 2, 0.5, 3.7, 2.0, np.nan, np.inf, 1e300, 1e-300, "a", 10**9])
-
-
-@st.composite
-def damaged(draw, array):
-    """Return an array with something odd about its values, type or shape, or as it is."""
-    array = np.array(array)
-    match draw(st.sampled_from(["", "", "value", "value", "scale", "flat", "type", "shape"])):
-        case "value":
-            array[draw(st.integers(0, len(array) - 1))] = draw(_ODD)
-            array.flat[draw(st.integers(0, array.size - 1))] = draw(_ODD)
-        case "scale":
-            array = array * 10.0 ** draw(st.integers(-320, 308))
-        case "flat":
-            array = np.full_like(array, draw(_ODD))
-        case "type":
-            kind = draw(st.sampled_from(["f2", "f4", ">f8", "i4", "u1", "?", "c16", "O", "U5"]))
-            array = array.astype(kind)
-        case "shape":
-            shapes = [array[..., None], array[0], array[:0], array[..., :0], array[..., :3]]
-            array = draw(st.sampled_from([*shapes, array.T, array[1:]]))
-    return array
 
 
 @st.composite
@@ -145,45 +121,6 @@ def write_inputs():
     fits.PrimaryHDU(STAR).writeto("psf.fits")
     fits.PrimaryHDU(GALAXIES.reshape(-1, SIDE)).writeto("image.fits")
     Path("positions.csv").write_text("id,x,y\n1,7.5,7.5\n2,8.0,23.0\n")
-
-
-def refused_or_done(arguments, *, refused=None):
-    """Run a command: it says in one line what is wrong and leaves nothing, or it is done."""
-    before = {file: file.read_bytes() for file in Path().iterdir()}
-    result = CliRunner().invoke(main, [str(argument) for argument in arguments])
-    assert "Traceback" not in result.output
-    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
-    if refused is not None:
-        assert (result.exit_code != 0) is refused, result.output
-    after = {file: file.is_file() and file.read_bytes() for file in Path().iterdir()}
-    if result.exit_code == 0:
-        assert set(after) - set(before) <= {Path("out.fits"), Path("nowhere.fits")}
-        return
-    assert after == before
-    lines = [line for line in result.output.splitlines() if line.startswith("Error: ")]
-    assert len(lines) == 1, result.output
-
-
-@st.composite
-def damaged_bytes(draw, content):
-    """Return a file cut short, with bytes changed, or something else altogether."""
-    match draw(st.sampled_from(["cut", "change", "header", "noise", "empty", "zip"])):
-        case "cut":
-            return content[: draw(st.integers(0, len(content) - 1))]
-        case "change":
-            some = bytearray(content)
-            for _ in range(draw(st.integers(1, 20))):
-                some[draw(st.integers(0, len(some) - 1))] = draw(st.integers(0, 255))
-            return bytes(some)
-        case "header":
-            card = 80 * draw(st.integers(0, 9))
-            odd = draw(st.sampled_from([b"NAXIS1  = -5", b"BITPIX  = 7", b"END", b"\xff", b""]))
-            return content[:card] + odd.ljust(80) + content[card + 80 :]
-        case "noise":
-            return draw(st.binary(min_size=1, max_size=400))
-        case "zip":
-            return gzip.compress(content)[: draw(st.integers(20, 400))]
-    return b""
 
 
 @settings(max_examples=40)

@@ -408,6 +408,14 @@ def test_noise_of_another_shape_is_refused(stamps, psf, dtype, to_xp):
 # --- arrays as people hold them ------------------------------------------------------
 
 
+def test_a_variance_is_any_number():
+    images, star_of = galaxies(E), fx.Psf.from_image(star())
+    expected = fx.measure_shapes(images, star_of, noise_variance=0.25)
+    for number in (np.float32(0.25), np.float64(0.25)):
+        actual = fx.measure_shapes(images, star_of, noise_variance=number)
+        np.testing.assert_array_equal(actual.eta_cov, expected.eta_cov)
+
+
 @pytest.mark.parametrize(
     "held",
     [

@@ -14,6 +14,7 @@ from fdnt_xp.app.cli import main
 from fdnt_xp.app.psf_check import Verdict, conclusions, plot_verdicts, stamp_size, table_row
 from fdnt_xp.data import noise_bias as noise_bias_module
 from fdnt_xp.data.calibration import Calibration, _calibration, error_calibration
+from fdnt_xp.data.coloured_noise import coloured_stamps
 from fdnt_xp.data.noise_bias import NoiseBias, noise_bias
 from fdnt_xp.data.noise_power import measure_noise_power
 from fdnt_xp.data.own_psf import psf_of_image
@@ -135,6 +136,17 @@ def test_correlated_noise_has_its_spectrum_and_is_told(versions, monkeypatch):
     low = (slice(0, 6), slice(0, 6))
     assert np.mean(measured.power[low]) == pytest.approx(np.mean(told[low]), rel=0.1)
     assert np.all(seen[0].symmetry % 4 == 0)
+
+
+def test_stamps_of_it_know_no_opposite_edge():
+    stamps = coloured_stamps(np.random.default_rng(3), 1000, 2.0 * spectrum())
+    # A lag of one pixel within a stamp, and the same around its edge.
+    near = np.mean(stamps[:, :, 0] * stamps[:, :, 1])
+    around = np.mean(stamps[:, :, 0] * stamps[:, :, -1])
+    assert near > 0.2 * np.mean(stamps**2)
+    assert abs(around) < 0.02 * np.mean(stamps**2)
+    again = measure_noise_power(stamps)
+    np.testing.assert_allclose(again.variance, 2.0 * np.mean(spectrum()), rtol=0.02)
 
 
 def test_the_estimators_take_the_spectrum(versions):
@@ -262,6 +274,7 @@ def folder(tmp_path, monkeypatch):
     fits.PrimaryHDU(image(with_pixel(moffat()))).writeto("psf.fits")
     blank = 10.0 * np.random.default_rng(1).standard_normal((6 * SIZE, 6 * SIZE))
     fits.PrimaryHDU(blank).writeto("white.fits")
+    fits.PrimaryHDU(blank + 1000.0).writeto("sky.fits")
     fits.PrimaryHDU(blank + np.roll(blank, 1, axis=1)).writeto("correlated.fits")
     return tmp_path
 
@@ -300,6 +313,7 @@ def test_noise_images(folder):
         ((*SMALL, "--snr", "10,x"), "--snr must be numbers"),
         (("--psf", "none.fits"), "does not exist"),
         ((*SMALL, "--oversampling", -1), "oversampling"),
+        ((*SMALL, "--psf", "sky.fits"), "the PSF is the image of one star"),
     ],
 )
 def test_what_the_command_refuses_is_one_line(folder, arguments, says):

@@ -8,8 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from astropy.io import fits
+from click.testing import CliRunner
 
 import fdnt_xp as fx
+from fdnt_xp.app.cli import main
+from fdnt_xp.data.catalog import read_catalog
 from fdnt_xp.data.psf_models import draw_stars, read_piff, read_psfex
 from fdnt_xp.errors import (
     CatalogError,
@@ -298,3 +301,71 @@ def test_a_piff_file_that_is_none(monkeypatch, tmp_path, psfex_file):
         read_piff(psfex_file)
     with pytest.raises(CatalogError, match="there is no file"):
         read_piff(tmp_path / "none.piff")
+
+
+# --- the command ----------------------------------------------------------------------
+
+
+@pytest.fixture
+def folder(psfex_file, monkeypatch):
+    """A working directory with an image of four galaxies behind the PSF of `model.psf`."""
+    monkeypatch.chdir(psfex_file.parent)
+    middles = np.array([[19.5, 19.5], [59.5, 19.5], [19.5, 59.5], [59.5, 59.5]])
+    cells = []
+    for x, _ in middles:
+        stars = [gaussian_covariance((0.2, 0.1), sigma) for sigma in (2.0, 2.2)]
+        galaxy = gaussian_covariance((-0.1, 0.2), 2.0)
+        parts = [gaussian_image(galaxy + one, (40, 40)) for one in stars]
+        cells.append(parts[0] + x / 100.0 * (parts[1] - parts[0]))
+    image = np.block([[cells[0], cells[1]], [cells[2], cells[3]]])
+    fits.PrimaryHDU(image).writeto("image.fits")
+    return middles
+
+
+MEASURE = ("measure", "image.fits", "--cell", "40", "--noise-variance", "1e-6", "--quiet")
+
+
+def catalog(*arguments):
+    result = CliRunner().invoke(main, [*MEASURE, *arguments, "-o", "out.fits", "--overwrite"])
+    assert result.exit_code == 0, result.output
+    return read_catalog("out.fits")
+
+
+@pytest.mark.parametrize("kind", [(), ("--responses",)], ids=str)
+def test_a_catalog_with_a_model_is_that_with_its_stars(kind, folder):
+    table = catalog("--psf", "model.psf", "--psf-model", "psfex", "--chunk", "3", *kind)
+    stars = draw_stars(read_psfex("model.psf"), folder, size=40)
+    fits.PrimaryHDU(stars.images[stars.psf_index]).writeto("stars.fits")
+    same = catalog("--psf", "stars.fits", *kind)
+    assert table.colnames == same.colnames
+    for name in table.colnames:
+        np.testing.assert_allclose(table[name], same[name], rtol=1e-9, atol=1e-12)
+    assert table.meta["PSFMODEL"] == "psfex"
+    assert "PSFMODEL" not in same.meta
+    assert len(np.unique(table["psf_size"])) == 2
+    if not kind:
+        np.testing.assert_allclose(table["e1"], -0.1, atol=0.01)
+        np.testing.assert_allclose(table["e2"], 0.2, atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--psf", "image.fits", "--psf-model", "psfex"), "image.fits is no PSFEx model"),
+        (("--psf", "no.psf", "--psf-model", "psfex"), "there is no file"),
+        (("--psf", "model.psf"), "holds no image"),
+    ],
+)
+def test_models_that_are_refused(arguments, says, folder):
+    result = CliRunner().invoke(main, [*MEASURE, *arguments, "-o", "out.fits"])
+    assert result.exit_code == 1
+    assert result.output.startswith("Error: ")
+    assert says in result.output
+    assert result.output.count("\n") == 1
+
+
+def test_a_cube_has_no_places(folder):
+    fits.PrimaryHDU(np.ones((2, 40, 40))).writeto("cube.fits")
+    command = ["measure", "cube.fits", "--psf", "model.psf", "--psf-model", "psfex", "-o", "o.fits"]
+    result = CliRunner().invoke(main, command)
+    assert "Error: --psf-model psfex wants an image with --cell or --positions" in result.output

@@ -7,7 +7,7 @@ import pytest
 from array_api_extra.testing import assert_close
 
 import fdnt_xp as fx
-from fdnt_xp.errors import FdntValueError, NamespaceError, ShapeMismatchError
+from fdnt_xp.errors import FdntTypeError, FdntValueError, NamespaceError, ShapeMismatchError
 from fdnt_xp.flags import flag_names
 from fdnt_xp.fourier.grid import half_plane_disc
 from fdnt_xp.fourier.noise import DeconvolvedNoise, PixelNoise
@@ -193,5 +193,7 @@ def test_calls_that_mean_nothing(to_xp):
             measure(stamps, psf, jacobian=to_xp(np.ones((2, 2))))
         with pytest.raises(NamespaceError, match="jacobian"):
             measure(stamps, psf, jacobian=to_xp(np.eye(2), "float32"))
+        with pytest.raises(FdntTypeError, match="jacobian must be an array"):
+            measure(stamps, psf, jacobian=[[1.0, 0.0], [0.0, 1.0]])
     none = fx.measure_responses(stamps[:0, ...], psf, jacobian=to_xp(np.ones((0, 2, 2))))
     assert none.n_gal == 0

@@ -143,6 +143,77 @@ def test_the_error_is_the_scatter_of_samples():
     assert predicted < mean / np.sqrt(40)
 
 
+def through_pixels(g, jacobians):
+    """Return the ring on the sky seen through a Jacobian for each galaxy, and its PSFs."""
+    n = len(jacobians)
+    angle = np.linspace(0.0, 2.0 * np.pi, n, endpoint=False)
+    shapes = 0.4 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    lens = eta_from_reduced_shear(np.asarray(g)[None, :])
+    stamps, stars = [], []
+    for eta, jacobian in zip(add_shears(lens, shapes), jacobians, strict=True):
+        back = np.linalg.inv(jacobian)
+        galaxy = back @ (covariance_of(eta, 2.2) + PSF_COVARIANCE) @ back.T
+        stamps.append(gaussian_image(galaxy, (SIDE, SIDE), centre=(0.4, -0.3)))
+        stars.append(gaussian_image(back @ PSF_COVARIANCE @ back.T, (SIDE, SIDE)))
+    return np.stack(stamps), np.stack(stars)
+
+
+def test_every_galaxy_may_have_its_own_pixels(xp, dtype, to_xp, to_np):
+    turn = np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]])
+    kinds = [np.diag([-1.0, 1.0]), turn, np.array([[1.1, 0.1], [0.0, 0.95]])]
+    jacobians = np.stack([kinds[i % 3] for i in range(12)])
+    stamps, stars = through_pixels([0.03, -0.02], jacobians)
+    psf = fx.Psf.from_image(to_xp(stars, dtype))
+    estimate = fx.shear_from_stack(to_xp(stamps, dtype), psf, jacobian=to_xp(jacobians, dtype))
+    assert estimate.g.dtype == dtype
+    atol = 1e-6 if dtype == xp.float64 else 1e-4
+    np.testing.assert_allclose(to_np(estimate.g), [0.03, -0.02], atol=atol)
+    # Where it is not said how the pixels lie, there is no common shear.
+    plain = fx.shear_from_stack(to_xp(stamps, dtype), psf)
+    assert np.max(np.abs(to_np(plain.g) - [0.03, -0.02])) > 1e-2
+
+
+def test_pixels_may_be_of_many_sizes():
+    # In the unit of the largest, wave numbers behind the smallest go beyond pi.
+    jacobians = np.stack([(0.7, 1.0, 1.65)[i % 3] * np.eye(2) for i in range(12)])
+    stamps, stars = through_pixels([0.03, -0.02], jacobians)
+    estimate = fx.shear_from_stack(stamps, fx.Psf.from_image(stars), jacobian=jacobians)
+    np.testing.assert_allclose(estimate.g, [0.03, -0.02], atol=1e-5)
+    null = fx.population_null(stamps, fx.Psf.from_image(stars), jacobian=jacobians, statistic="eta")
+    np.testing.assert_allclose(null.g, [0.03, -0.02], atol=1e-5)
+
+
+def test_a_bad_jacobian_is_left_out():
+    jacobians = np.stack([np.eye(2)] * 16)
+    stamps, stars = through_pixels([0.03, -0.02], jacobians)
+    jacobians[[0, 8]] = [[[1.0, 1.0], [1.0, 1.0]], [[np.nan, 0.0], [0.0, 1.0]]]
+    with pytest.warns(FdntWarning, match="2 of 16 stamps left out"):
+        estimate = fx.shear_from_stack(stamps, fx.Psf.from_image(stars), jacobian=jacobians)
+    assert (estimate.n_used, estimate.n_excluded) == (14, 2)
+    np.testing.assert_allclose(estimate.g, [0.03, -0.02], atol=0.02)
+    # Degrees among arcsec would make one unit of length for all of no use.
+    jacobians = np.stack([np.eye(2)] * 16)
+    jacobians[[0, 8]] /= 3600.0
+    with pytest.warns(FdntWarning, match="2 of 16 stamps left out"):
+        fx.shear_from_stack(stamps, fx.Psf.from_image(stars), jacobian=jacobians)
+    jacobians[:] = 0.0
+    with pytest.raises(FdntValueError, match="0 usable stamps in 0 groups"):
+        fx.shear_from_stack(stamps, fx.Psf.from_image(stars), jacobian=jacobians)
+    with pytest.raises(FdntValueError, match="the stack has no shape"):
+        fx.shear_from_stack(-stamps, fx.Psf.from_image(stars), jacobian=np.stack([np.eye(2)] * 16))
+
+
+def test_noisy_galaxies_stack_alike_as_images_and_as_tests():
+    _, stamps = ring([0.03, -0.02], [PSF_COVARIANCE], n=64)
+    noise = np.random.default_rng(4).standard_normal(stamps.shape)
+    noisy = stamps + np.sqrt(np.sum(stamps[0] ** 2)) / 20.0 * noise
+    psf = fx.Psf.from_image(star())
+    images = fx.shear_from_stack(noisy, psf)
+    tests = fx.shear_from_stack(noisy, psf, jacobian=np.stack([np.eye(2)] * 64))
+    np.testing.assert_allclose(tests.g, images.g, atol=1e-7)
+    np.testing.assert_allclose(tests.g_err, images.g_err, rtol=0.01)
+
+
 # --- galaxies that are no ellipses ---------------------------------------------------
 
 

@@ -31,6 +31,9 @@ class Command(click.Command):
                 return super().invoke(ctx)
         except FdntError as error:
             raise click.ClickException(" ".join(str(error).split())) from error
+        except MemoryError as error:
+            reason = " ".join(str(error).split()) or "no more memory"
+            raise click.ClickException(f"out of memory: {reason}") from error
         except KeyboardInterrupt as interrupt:
             kept = str(interrupt) or "nothing unfinished was left behind"
             click.echo(f"Interrupted: {kept}.", err=True)

@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fdnt_xp.data.images import image_file, read_header, read_image
+from fdnt_xp.data.images import Pixels, image_file, read_header, read_image
+from fdnt_xp.data.model_stars import ModelStars
+from fdnt_xp.data.psf_models import read_piff, read_psfex
 from fdnt_xp.data.stamps import StampSource, cube_stamps, grid_stamps, position_stamps
 from fdnt_xp.data.tables import read_positions
 from fdnt_xp.data.wcs import wcs_jacobians
@@ -24,7 +26,9 @@ class Inputs:
     Parameters
     ----------
     image, psf : str
-        FITS files.
+        FITS or HDF5 files.
+    psf_model : str
+        What `psf` is: "image", or a model of "psfex" or "piff".
     cell : int or None
         Side of the cells, if the image is a grid of them.
     positions : str or None
@@ -59,6 +63,7 @@ class Inputs:
     weight: str | None = None
     jacobian: str | None = None
     wcs: bool = False
+    psf_model: str = "image"
 
     @property
     def layout(self) -> str:
@@ -155,6 +160,20 @@ def open_source(inputs: Inputs) -> StampSource:
             "where its galaxies are, by --cell or by --positions and --stamp-size"
         )
     return cube_stamps(pixels)
+
+
+def open_psf(inputs: Inputs, source: StampSource, oversampling: int) -> Pixels | ModelStars:
+    """Open the PSF: an image, a cube with one for each galaxy, or a model to be drawn there."""
+    if inputs.psf_model == "image":
+        return read_image(inputs.psf, ndim=(2, 3), what="PSF image")
+    if inputs.layout == "cube":
+        raise FdntValueError(
+            f"--psf-model {inputs.psf_model} wants an image with --cell or --positions: it is "
+            "not known where the stamps of a cube were"
+        )
+    read = read_psfex if inputs.psf_model == "psfex" else read_piff
+    side = min(source.stamp_shape) * oversampling
+    return ModelStars(read(inputs.psf), source.positions, size=side, oversampling=oversampling)
 
 
 def find_jacobians(inputs: Inputs, method: str, source: StampSource) -> NDArray[np.float64] | None:

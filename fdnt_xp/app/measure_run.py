@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import fdnt_xp.peers  # noqa: F401  gives its methods their names
 from fdnt_xp.app.backends import Backend, load_backend
 from fdnt_xp.app.chunks import ChunkSize
-from fdnt_xp.app.measure import Inputs, Settings, find_jacobians, open_beside, open_source
+from fdnt_xp.app.measure import Inputs, Settings, find_jacobians, open_beside, open_psf, open_source
 from fdnt_xp.app.noise import Noise, find_noise
 from fdnt_xp.app.parts import PartsReport, PartsRun, Rows
 from fdnt_xp.app.responses import common_size, response_measurer
@@ -201,7 +201,7 @@ def _make_plan(inputs: Inputs, settings: Settings) -> tuple[Plan, Work]:
 def _open(inputs: Inputs, settings: Settings) -> tuple[StampSource, ChunkPsfs]:
     backend = load_backend(settings.backend, settings.device, settings.dtype)
     source = open_source(inputs)
-    pixels = read_image(inputs.psf, ndim=(2, 3), what="PSF image")
+    pixels = open_psf(inputs, source, settings.oversampling)
     return source, ChunkPsfs.of(pixels, source, backend, settings.oversampling)
 
 
@@ -266,6 +266,7 @@ def _facts(
         dtype=backend.dtype,
         image=inputs.image,
         psfimage=inputs.psf,
+        psfmodel=None if inputs.psf_model == "image" else inputs.psf_model,
         layout=inputs.layout,
         cell=inputs.cell,
         poscat=inputs.positions,

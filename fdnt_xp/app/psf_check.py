@@ -44,6 +44,8 @@ _RADII: Final = (0.7, 1.5)
 _LEAST_STAMP: Final = 48
 _STAMP_PER_RADIUS: Final = 24.0
 """Pixels of a stamp per half-light radius of the PSF: the wings of the galaxies need them."""
+_LARGEST_STAMP: Final = 480
+"""Of a PSF that is none but an image of many stars, or of sky, it would be as large as that."""
 _CHANCE: Final = 1e-3
 """Of a deviation that is none to be called one."""
 _RIGHT: Final = 0.1
@@ -164,6 +166,11 @@ def run_psf_check(
     image = native_pixels(read_image(own.psf, what="PSF image"))
     psf = psf_of_image(image, oversampling=own.oversampling, pixel=own.pixel)
     size = stamp_size(psf)
+    if size > _LARGEST_STAMP:
+        raise FdntValueError(
+            f"half the light of {own.psf} is within {psf.half_light_radius:.0f} pixels: the PSF is "
+            "the image of one star, with its background taken off"
+        )
     variance, power = _noise(own, size)
     to_array = load_backend(options.backend, options.device, options.dtype).from_numpy
     yield from describe(own, psf, size, options.shear)

@@ -17,6 +17,7 @@ from fdnt_xp.arrays import Array
 from fdnt_xp.data.fits_pixels import let_go
 from fdnt_xp.data.images import Pixels, native_pixels
 from fdnt_xp.data.ivar import IvarSource
+from fdnt_xp.data.model_stars import ModelStars
 from fdnt_xp.data.stamps import StampChunk, StampSource
 from fdnt_xp.errors import FdntValueError, ShapeMismatchError
 from fdnt_xp.fourier.psf import Psf
@@ -151,7 +152,7 @@ class ChunkPsfs:
         Its shape.
     """
 
-    pixels: Pixels
+    pixels: Pixels | ModelStars
     backend: Backend
     oversampling: float
     common: Psf | None = None
@@ -159,7 +160,7 @@ class ChunkPsfs:
 
     @classmethod
     def of(
-        cls, pixels: Pixels, source: StampSource, backend: Backend, oversampling: float
+        cls, pixels: Pixels | ModelStars, source: StampSource, backend: Backend, oversampling: float
     ) -> ChunkPsfs:
         """Return the PSFs of the galaxies of a source.
 
@@ -168,6 +169,8 @@ class ChunkPsfs:
         ShapeMismatchError
             If there are PSFs for another number of galaxies.
         """
+        if isinstance(pixels, ModelStars):
+            return cls(pixels=pixels, backend=backend, oversampling=oversampling)
         if pixels.ndim == 3 and len(pixels) not in (1, source.n_gal):
             raise ShapeMismatchError(
                 f"there are {len(pixels)} PSF images but {source.n_gal} galaxies; "

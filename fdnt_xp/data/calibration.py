@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdnt_xp.arrays import Array, to_numpy
-from fdnt_xp.data.noise_bias import coloured
+from fdnt_xp.data.coloured_noise import coloured_stamps
 from fdnt_xp.data.noise_power import SIGMA_PER_MAD
 from fdnt_xp.data.versions import Versions
 from fdnt_xp.errors import FdntValueError, FdntWarning, RangeError
@@ -96,8 +96,8 @@ def error_calibration(
         raise RangeError("n_stamps", n_stamps, 1, None)
     sigma = math.sqrt(np.mean(np.sum(versions.stamps**2, axis=(-2, -1)))) / snr
     shape = versions.stamps.shape[-2:]
-    spectrum = np.full(shape, sigma**2) if power is None else sigma**2 * power / np.mean(power)
-    told = {"noise_variance": sigma**2} if power is None else {"noise_power": to_array(spectrum)}
+    spectrum = None if power is None else sigma**2 * power / np.mean(power)
+    told = {"noise_variance": sigma**2} if spectrum is None else {"noise_power": to_array(spectrum)}
     psf = Psf.from_image(to_array(versions.psf_images[0]))
     n_groups = max(2, math.ceil(n_stamps / (2 * _GALAXIES * _TIMES)))
     rng = np.random.default_rng([seed, 77, round(1000 * snr)])
@@ -105,8 +105,7 @@ def error_calibration(
     for group in range(n_groups):
         rows = (group * _GALAXIES + np.arange(_GALAXIES)) % len(versions.stamps)
         clean = np.concatenate([versions.stamps[rows, turned, 0] for turned in (0, 1)])
-        white = rng.standard_normal((_TIMES, *clean.shape))
-        noise = coloured(white, spectrum)
+        noise = _noise(rng, _TIMES * len(clean), shape, sigma, spectrum).reshape(-1, *clean.shape)
         truth = measure_shapes(to_array(clean), psf)
         for number in range(_TIMES):
             stamps = to_array(clean + noise[number])
@@ -129,6 +128,18 @@ def error_calibration(
         float(np.mean(failed)),
         float(np.mean(lost)),
     )
+
+
+def _noise(
+    rng: np.random.Generator,
+    n: int,
+    shape: tuple[int, int],
+    sigma: float,
+    spectrum: NDArray[np.float64] | None,
+) -> NDArray[np.float64]:
+    if spectrum is None:
+        return sigma * rng.standard_normal((n, *shape))
+    return coloured_stamps(rng, n, spectrum)
 
 
 def _calibration(

@@ -101,7 +101,7 @@ def read_header(path: str | os.PathLike[str], *, what: str = "image") -> fits.He
     """
     file, extension = _split(path)
     read_image(path, ndim=(2, 3), what=what)  # for its messages
-    with fits.open(file, memmap=True) as hdus:
+    with file.open("rb") as stream, fits.open(stream, memmap=True) as hdus:
         chosen = [hdus[extension]] if extension is not None else hdus
         return next(hdu.header.copy() for hdu in chosen if hdu.is_image and hdu.shape)
 

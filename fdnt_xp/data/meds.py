@@ -14,7 +14,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, TypeAlias
@@ -228,11 +228,12 @@ def open_meds(
     if not file.is_file():
         problem = "is a folder" if file.is_dir() else "does not exist"
         raise CatalogError(f"cannot read the {_WHAT}: {file} {problem}")
-    with fits_errors(file, _WHAT):
-        # Not mapped: what has been read of a map stays in memory until another wants it.
-        hdus = fits.open(file, memmap=False)
-    with hdus:
+    with ExitStack() as stack:
         with fits_errors(file, _WHAT):
+            # Astropy leaves a file that is broken open, unless it is ours to close. Not mapped:
+            # what has been read of a map stays in memory until another wants it.
+            stream = stack.enter_context(file.open("rb"))
+            hdus = stack.enter_context(fits.open(stream, memmap=False))
             meds = _found(file, hdus, options)
         if meds.index.n_lost:
             warnings.warn(

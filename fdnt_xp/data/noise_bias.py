@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from fdnt_xp.arrays import Array, to_numpy
+from fdnt_xp.data.coloured_noise import coloured_stamps
 from fdnt_xp.data.noise_estimators import ESTIMATORS, Settings, arrays_of, check_estimators
 from fdnt_xp.data.other_codes import Found, NoisyStamps, turn_quarter
 from fdnt_xp.data.versions import Population, Versions
@@ -165,7 +166,8 @@ def noise_bias(
         have such a control, without cuts. It changes the errors alone.
     power : array, shape (ny, nx), optional
         Power spectrum of the noise, up to a factor, where it is correlated between pixels; as
-        `population_null` takes it. Errors of m are then larger, without a control.
+        `population_null` takes it. The noise is cut out of larger fields, as that of a survey
+        is. Errors of m are then larger, without a control.
     seed : int
         Of the noise.
     to_array : callable
@@ -246,12 +248,6 @@ def _one_or_all(images: NDArray[np.float64]) -> NDArray[np.float64]:
     return images[0] if len(images) == 1 else images
 
 
-def coloured(white: NDArray[np.float64], power: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return noise of a power spectrum, made of stamps of white noise of variance 1."""
-    # The same at k and -k, so that what comes back is real.
-    return np.fft.ifft2(np.fft.fft2(white) * np.sqrt(power)).real
-
-
 def noisy_pair(
     versions: Versions,
     number: int,
@@ -278,8 +274,10 @@ def noisy_pair(
     names = number * batch + np.arange(batch)
     rows = names % versions.population.n_gal
     size = versions.population.stamp_size
-    white = rng.standard_normal((batch, size, size))
-    noise = sigma * white if power is None else coloured(white, power)
+    if power is None:
+        noise = sigma * rng.standard_normal((batch, size, size))
+    else:
+        noise = coloured_stamps(rng, batch, power)
     turned = turn_quarter(noise) if power is None else noise
     symmetries = SYMMETRIES if power is None else _UNTURNED
     added = int(rng.integers(2**31))

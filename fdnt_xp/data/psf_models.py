@@ -155,7 +155,8 @@ def read_piff(path: str | Path) -> Any:
     try:
         return piff.read(str(path))
     except Exception as error:  # it raises whatever its readers do
-        raise CatalogError(f"{path} is no Piff model: {error}") from error
+        reason = str(error) or type(error).__name__
+        raise CatalogError(f"{path} is no Piff model: {reason}") from error
 
 
 def read_psfex(path: str | Path, image: str | Path | None = None) -> Any:

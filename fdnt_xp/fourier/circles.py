@@ -22,7 +22,7 @@ _TABLE_NODES, _TABLE_ANGLES = 97, 24
 gives a valid null test. It must be smooth in k, which it is for any number of angles."""
 CIRCLES, CIRCLE_POINTS = 25, _TABLE_ANGLES
 """Of the table of `|T|²` on circles, every fourth of those, and points on half of each."""
-_PSFS_AT_ONCE, _PSFS_IN_CACHE = 64, 8
+_PSFS_AT_ONCE, _PSFS_IN_CACHE = 64, 2
 """Bounds the memory of the trigonometric sums."""
 
 

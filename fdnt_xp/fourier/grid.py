@@ -190,11 +190,17 @@ class KGrid:
 
         `kappa.x' = k.x` with `kappa = S_gamma k` holds for `x = S_gamma x'`.
         """
-        return position if self.shear is None else _moved(shear_matrix(self.shear), position)
+        return position if self.shear is None else _moved(self._matrices[0], position)
 
     def from_stamp(self, position: Array) -> Array:
         """Return the position in this grid's frame of one on the stamp, shape (n_gal, 2)."""
-        return position if self.shear is None else _moved(shear_matrix(-self.shear), position)
+        return position if self.shear is None else _moved(self._matrices[1], position)
+
+    @cached_property
+    def _matrices(self) -> tuple[Array, Array]:
+        """Return `S_gamma` and its inverse."""
+        assert self.shear is not None
+        return shear_matrix(self.shear), shear_matrix(-self.shear)
 
 
 def _moved(matrix: Array, position: Array) -> Array:

@@ -36,6 +36,8 @@ _PSFS_AT_ONCE: Final = 64
 """Bounds the memory of the trigonometric sums."""
 _LEAST_POWER: Final = 1e-3
 """Of the variance: least power of correlated noise that is told from none."""
+_LAGS_KNOWN: Final = 0.25
+"""Of a stamp: the lags up to which a correlation is taken as it is."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,19 +89,17 @@ class PixelNoise:
 
         A stamp of n pixels has `n - |lag|` pairs of pixels at a lag, along each axis: so
         much less of a correlation is in its periodogram, and in the correlation function that
-        is made of it. Lags beyond half a stamp, of which there is no telling, are taken for
-        none.
+        is made of it. That is made good, for lags up to a quarter of a stamp. Beyond, where
+        there is little but the error of a measured spectrum, the correlation is led to none at
+        half a stamp: with all lags made good the error of each mode would be twice that of the
+        periodogram, and so is a tenth larger.
         """
         if self.correlation is None:
             return self
-        xp = array_namespace(correlation=self.correlation)
-        like = {"dtype": self.correlation.dtype, "device": device_of(self.correlation)}
         along_y, along_x = (
-            1.0 - xp.abs(xp.arange(n, **like) - float(n // 2)) / n
-            for n in (int(size) for size in self.correlation.shape[1:])
+            _without_triangle(int(n), self.correlation) for n in self.correlation.shape[1:]
         )
-        pairs = along_y[:, None] * along_x[None, :]
-        return replace(self, correlation=self.correlation / pairs)
+        return replace(self, correlation=self.correlation * (along_y[:, None] * along_x[None, :]))
 
     @property
     def shared(self) -> bool:
@@ -244,6 +244,17 @@ class RoundNoise:
         return DeconvolvedStamps(re=galaxies.re + scale * self.re, im=galaxies.im + scale * self.im)
 
 
+def _without_triangle(n: int, like: Array) -> Array:
+    """Return by what to multiply the lags `-(n//2) ...` along an axis of n pixels, shape (n,)."""
+    xp = array_namespace(like=like)
+    lags = xp.arange(n, dtype=like.dtype, device=device_of(like)) - float(n // 2)
+    part = xp.abs(lags) / n
+    t = xp.minimum(
+        xp.maximum((0.5 - part) / (0.5 - _LAGS_KNOWN), xp.zeros_like(part)), xp.ones_like(part)
+    )
+    return 0.5 * (1.0 - xp.cos(math.pi * t)) / (1.0 - part)
+
+
 def _ln_polar(psf: Psf, pixels: PixelNoise) -> Array:
     """Return ln P/|T|² on the circles of the PSFs, shape (n_psf, n_circle, n_point)."""
     xp = array_namespace(kmax=psf.kmax)
@@ -252,7 +263,7 @@ def _ln_polar(psf: Psf, pixels: PixelNoise) -> Array:
     t = xp.linspace(0.0, 1.0, CIRCLES, dtype=psf.kmax.dtype, device=device_of(psf.kmax))
     radii = psf.circle_kmax[:, None] * t[None, :]
     parts = []
-    for first in range(0, psf.n_psf, _PSFS_AT_ONCE):
+    for first in range(0, max(psf.n_psf, 1), _PSFS_AT_ONCE):
         rows = slice(first, min(first + _PSFS_AT_ONCE, psf.n_psf))
         correlation = pixels.take(rows).correlation
         unit = None if psf.unit_jacobian is None else psf.unit_jacobian[rows, :, :]

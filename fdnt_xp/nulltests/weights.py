@@ -224,7 +224,9 @@ def _width_table(psf: Psf, largest_size: float) -> WidthTable:
     measure = psf.weight.evaluate(grid, row)[0] * (t * xp.asarray(weights, **like))[None, :]
 
     narrow = xp.full_like(psf.kmax, _NARROWEST**2)
-    wide = xp.maximum((largest_size * psf.kmax) ** 2, 4.0 * narrow)
+    # Above pi, where wave numbers are in a unit that is longer than a pixel: so is the cell then.
+    kmax = xp.minimum(psf.kmax, xp.full_like(psf.kmax, math.pi))
+    wide = xp.maximum((largest_size * kmax) ** 2, 4.0 * narrow)
     ends = xp.stack([narrow, wide], axis=-1)
     by_width = _SquareTable.of(measure, t, largest_size)
     square_ends, _ = by_width.inverse_mean_square(ends, row)
@@ -254,7 +256,7 @@ class _SquareTable:
     def of(cls, measure: Array, t: Array, largest_size: float) -> _SquareTable:
         """Tabulate up to the largest size, pixels; `measure` (n_psf, n_t) holds `𝒯 t dt`."""
         xp = array_namespace(t=t)
-        # No kmax is above pi. Beyond its end a table has no slope.
+        # As if no kmax were above pi. Beyond its end a table has no slope.
         widest = 1.01 * max(largest_size * math.pi, 2.0 * _NARROWEST)
         root = xp.linspace(_NARROWEST, widest, _NODES, dtype=t.dtype, device=device_of(t))
         square = t**2

@@ -6,9 +6,11 @@ batch of them is rectangular.
 
 from __future__ import annotations
 
+import numbers
 from collections.abc import Iterator
 from dataclasses import dataclass
 from types import ModuleType
+from typing import Final
 
 import numpy as np
 
@@ -20,7 +22,7 @@ from fdnt_xp.arrays import (
     require_dtype,
     to_numpy,
 )
-from fdnt_xp.errors import FdntTypeError, FdntValueError, ShapeMismatchError
+from fdnt_xp.errors import FdntTypeError, FdntValueError, RangeError, ShapeMismatchError
 from fdnt_xp.flags import Flag
 from fdnt_xp.fourier.jacobian import pixel_scale, wave_frame
 from fdnt_xp.fourier.psf import Psf
@@ -29,6 +31,12 @@ from fdnt_xp.shapes.exposure_sources import StampSources, missing_fraction, with
 from fdnt_xp.shapes.job import check_count
 from fdnt_xp.shapes.pixels import Pixels, check_pixels
 from fdnt_xp.shapes.sky import SkyFrame, sky_frame
+
+_NAMED_AT_MOST: Final = 1_000_000
+_NAMED_PER_STAMP: Final = 100
+"""Objects beyond which, unless it is said how many there are, their numbers are no rows."""
+_BANDS_AT_MOST: Final = 1000
+"""Each has a column in the row of every object."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +94,7 @@ class ExposureStamps:
         none = np.flatnonzero(counts == 0)
         return xp.asarray(none, dtype=xp.int64, device=device_of(self.origin))
 
-    def batches(self, n_at_once: int) -> Iterator[ExposureBatch]:
+    def batches(self, n_at_once: int) -> Iterator[ObjectBatch]:
         """Yield all objects with stamps, in batches of equally many stamps each.
 
         `n_at_once` stamps are in work together, more only where one object has more.
@@ -107,7 +115,7 @@ class ExposureStamps:
                     xp.asarray(some, **like), xp.asarray(rows.reshape(-1), **like), n_each
                 )
 
-    def _batch(self, objects: Array, rows: Array, n_each: int) -> ExposureBatch:
+    def _batch(self, objects: Array, rows: Array, n_each: int) -> ObjectBatch:
         xp = array_namespace(rows=rows)
         jacobian, regular = None, xp.ones_like(rows, dtype=xp.bool)
         if self.sky is not None:
@@ -118,7 +126,7 @@ class ExposureStamps:
         flags = xp.where(regular, flags, xp.full_like(flags, int(Flag.BAD_JACOBIAN)))
         origin = xp.take(self.origin, rows, axis=0)
         unit, exposures = _on_sky(origin, jacobian, regular, n_each)
-        return ExposureBatch(
+        return ObjectBatch(
             objects=objects,
             rows=rows,
             unit=unit,
@@ -130,7 +138,7 @@ class ExposureStamps:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExposureBatch:
+class ObjectBatch:
     """Objects with equally many stamps, which are in their order.
 
     Parameters
@@ -231,6 +239,12 @@ def check_exposures(
     n_stamp = int(stamps.shape[0])
     index = _checked_numbers(xp, stamps, object_index, "object_index")
     highest = int(xp.max(index)) if n_stamp else -1
+    if n_objects is None and highest >= max(_NAMED_AT_MOST, _NAMED_PER_STAMP * n_stamp):
+        raise FdntValueError(
+            f"object_index goes up to {highest}, with {n_stamp} stamps: it counts objects from 0, "
+            "a row of the result for each; for names of another kind give "
+            "unique(names, return_inverse=True)[1], or say n_objects"
+        )
     n_objects = highest + 1 if n_objects is None else n_objects
     check_count("n_objects", n_objects, 0)
     n_objects = int(n_objects)
@@ -248,6 +262,9 @@ def check_exposures(
         flags = xp.where(good, flags, xp.full_like(flags, int(Flag.BAD_NOISE)))
     flags = xp.where(on_stamp, flags, xp.full_like(flags, int(Flag.OFF_IMAGE)))
     bands = None if band is None else _checked_numbers(xp, stamps, band, "band")
+    n_bands = 0 if bands is None or n_stamp == 0 else int(xp.max(bands)) + 1
+    if n_bands > _BANDS_AT_MOST:
+        raise RangeError("band", n_bands - 1, 0, _BANDS_AT_MOST - 1)
     return ExposureStamps(
         pixels=pixels,
         object_index=index,
@@ -257,12 +274,12 @@ def check_exposures(
         flags=flags,
         variance_known=known,
         band=bands,
-        n_bands=0 if bands is None or n_stamp == 0 else int(xp.max(bands)) + 1,
+        n_bands=n_bands,
     )
 
 
 def _is_zero(noise_variance: float | Array) -> bool:
-    return isinstance(noise_variance, int | float) and noise_variance == 0
+    return isinstance(noise_variance, numbers.Real) and noise_variance == 0
 
 
 def _checked_numbers(xp: ModuleType, stamps: Array, numbers: Array, name: str) -> Array:

@@ -20,7 +20,7 @@ from fdnt_xp.nulltests.exposures import ExposureTests, by_object
 from fdnt_xp.shapes.centroid import wide_weight
 from fdnt_xp.shapes.exposure_results import ExposureResult, ObjectShapes
 from fdnt_xp.shapes.exposure_solution import SeenObjects, solve_objects, stamp_tests
-from fdnt_xp.shapes.exposure_stamps import ExposureBatch, ExposureStamps, check_exposures
+from fdnt_xp.shapes.exposure_stamps import ExposureStamps, ObjectBatch, check_exposures
 from fdnt_xp.shapes.first_look import look
 from fdnt_xp.shapes.gl_fit import check_fit_order
 from fdnt_xp.shapes.job import Job, check_count, check_options, check_stamps, prepare
@@ -165,14 +165,14 @@ def measure_exposures(
 class _Measured:
     """A batch of objects, measured, and the flags and S/N of its stamps."""
 
-    batch: ExposureBatch
+    batch: ObjectBatch
     shapes: ObjectShapes
     flags: Array
     snr: Array
 
 
 def _measure_batch(
-    job: Job, batch: ExposureBatch, fill: int | None, n_bands: int, n_at_once: int
+    job: Job, batch: ObjectBatch, fill: int | None, n_bands: int, n_at_once: int
 ) -> _Measured:
     """Measure objects with equally many stamps: on the coarse grid, the few that need it finer."""
     every, job = job, job.take(batch.rows)

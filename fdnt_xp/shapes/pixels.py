@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import numbers
 from dataclasses import dataclass, replace
 from types import ModuleType
 
@@ -151,10 +152,11 @@ def noise_column(xp: ModuleType, noise_variance: float | Array | None, stamps: A
     like = stamps[:, 0, 0]
     if noise_variance is None:
         return xp.full_like(like, float("nan"))
-    if isinstance(noise_variance, int | float):
-        if not (math.isfinite(noise_variance) and noise_variance >= 0):
-            raise RangeError("noise_variance", float(noise_variance), 0.0, None)
-        return xp.full_like(like, float(noise_variance))
+    if isinstance(noise_variance, numbers.Real):
+        number = float(noise_variance)
+        if not (math.isfinite(number) and number >= 0):
+            raise RangeError("noise_variance", number, 0.0, None)
+        return xp.full_like(like, number)
     array_namespace(stamps=stamps, noise_variance=noise_variance)
     noise = as_floating(xp, noise_variance, "noise_variance")
     require_dtype(stamps.dtype, noise_variance=noise)

@@ -169,6 +169,9 @@ class FrozenQuadrupole:
             covariance = noise.variance[:, None, None] * covariance
             square = square + self.softening**2 * covariance[:, 2, 2]
         square = square + self.bound**2 * xp.sum(moments.quadrupole**2, axis=-1)
+        # Where squares leave the range of numbers, ratios of them mean nothing.
+        least = float(xp.finfo(square.dtype).smallest_normal)
+        found = found & xp.isfinite(square) & (square > least)
         safe = xp.sqrt(xp.where(found, square, xp.ones_like(square)))
         v = -moments.quadrupole / safe[:, None]
         if noise is not None:

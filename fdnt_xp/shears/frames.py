@@ -120,6 +120,8 @@ class FrameSample:
     the start of the next."""
     _optics: dict[int | None, _Optics] = field(default_factory=dict)
     """Of PSFs that galaxies share, by their number; None for the only one."""
+    _grids: dict[Gamma, KGrid] = field(default_factory=dict)
+    """In the frames that are looked at, for all chunks; not on the sky."""
 
     @property
     def n_gal(self) -> int:
@@ -150,6 +152,7 @@ class FrameSample:
     def evaluate(self, gammas: Sequence[Gamma]) -> list[SampleValues]:
         """Return the statistic of all galaxies in each frame."""
         parts: list[list[SampleValues]] = [[] for _ in gammas]
+        self._grids.clear()
         for number in range(len(self._chunks)):
             for of_frame, values in zip(parts, self._evaluate_chunk(number, gammas), strict=True):
                 of_frame.append(values)
@@ -196,10 +199,12 @@ class FrameSample:
         Where the pixels have Jacobians the shear is one of the sky: `kappa = S_gamma A k`.
         """
         xp = array_namespace(stamps=self.stamps)
-        shear = xp.asarray(gamma, dtype=self.stamps.dtype, device=device_of(self.stamps))
         weight = job.weight.shrunk(self.reach)
+        if weight.frame is None and gamma in self._grids:
+            return self._grids[gamma], weight
+        shear = xp.asarray(gamma, dtype=self.stamps.dtype, device=device_of(self.stamps))
         if weight.frame is None:
-            return job.coarse.sheared(shear), weight
+            return self._grids.setdefault(gamma, job.coarse.sheared(shear)), weight
         matrix = xp.matmul(shear_matrix(shear)[None, :, :], weight.frame)
         return SkyGrid.of(job.coarse, matrix), replace(weight, frame=matrix)
 

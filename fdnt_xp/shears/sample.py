@@ -239,7 +239,7 @@ def _sample_noise(xp: ModuleType, stamps: Array, options: NoiseOptions) -> Sampl
     if options.noise_variance is not None and options.noise_power is not None:
         raise FdntValueError("give noise_variance or noise_power, not both")
     if options.noise_power is not None:
-        pixels = power_noise(xp, stamps, options.noise_power)
+        pixels = power_noise(xp, stamps, options.noise_power).without_window()
     elif options.noise_variance is None:
         if options.isotropise:
             raise FdntValueError("isotropise needs noise_variance or noise_power")

@@ -22,25 +22,21 @@ from fdnt_xp.arrays import (
     count_true,
     device_of,
     require_dtype,
-    rows_of,
 )
 from fdnt_xp.errors import FdntValueError, FdntWarning, ShapeMismatchError
 from fdnt_xp.flags import flag_names
 from fdnt_xp.fourier.psf import Psf
-from fdnt_xp.fourier.transform import DeconvolvedStamps, deconvolve
-from fdnt_xp.nulltests.dogleg import DoglegOptions, find_root
+from fdnt_xp.fourier.transform import DeconvolvedStamps
 from fdnt_xp.nulltests.tests import NullTests
 from fdnt_xp.nulltests.weights import Weight
-from fdnt_xp.shapes.centroid import DipoleTests, starting_centroid, wide_weight
+from fdnt_xp.shapes.centroid import wide_weight
 from fdnt_xp.shapes.job import (
-    Chunk,
     Job,
     check_count,
     check_options,
     check_stamps,
     galaxies_at_once,
     prepare,
-    screen,
 )
 from fdnt_xp.shapes.results import ShapeResult
 from fdnt_xp.shapes.search import solve
@@ -48,6 +44,9 @@ from fdnt_xp.shapes.sky import sky_frame
 from fdnt_xp.shapes.solution import describe
 from fdnt_xp.shear import reduced_shear_from_eta
 from fdnt_xp.shears.estimate import ShearEstimate
+from fdnt_xp.shears.sky import SampleSky
+from fdnt_xp.shears.sky_stack import stack_on_sky
+from fdnt_xp.shears.stack_sample import StackSample, StackShapes, refuse_too_few
 from fdnt_xp.shears.weights import galaxy_weights
 
 _MAX_ITER: Final = 50
@@ -95,9 +94,10 @@ def shear_from_stack(
         stack is biased: by 3 % in GREAT08.
     n_groups : int
         Groups of the jackknife: consecutive stamps, so that pairs stay together.
-    jacobian : array, shape (2, 2), optional
+    jacobian : array, shape (2, 2) or (n_gal, 2, 2), optional
         `d(u, v)/d(x, y)` of the pixels, as for `measure_shapes`: the shear is then that on the
-        sky. One for all stamps: what is stacked has to be on one grid.
+        sky. Where each galaxy has its own it is their null tests that are summed, which have
+        the sky in common, not their images.
     padding : int
         Makes the k grid finer by this factor.
     chunk_size : int, optional
@@ -143,58 +143,32 @@ def shear_from_stack(
     everyone = xp.ones(n_gal, dtype=xp.bool, device=device_of(stamps))
     weights = xp.astype(galaxy_weights(everyone, galaxy_weight), stamps.dtype)
     centres = _from_the_middle(xp, stamps, centroids)
-    psf = psf if jacobian is None else _on_sky(xp, stamps, psf, jacobian)
-
+    regular = None
+    single = jacobian is None or getattr(jacobian, "ndim", 2) == 2
+    if jacobian is not None and single:
+        psf = sky_frame(xp, stamps, n_gal, jacobian).seen_by(psf)
+    elif jacobian is not None:
+        sky = SampleSky.of(xp, stamps, psf, jacobian)
+        psf, regular = sky.psf, sky.regular
     job = prepare(xp, stamps, psf, padding=padding, max_iter=_MAX_ITER)
-    sample = _Sample(
+    sample = StackSample(
         stamps=stamps,
         weights=weights,
         centres=centres,
         normalise=normalise,
         n_groups=min(n_groups, n_gal),
         chunks=job.chunks(n_gal, chunk_size or galaxies_at_once(job.coarse, stamps)),
+        regular=regular,
     )
-    stack, shapes = _solved(job, _common_weight(job), sample)
-    if stack.n_excluded:
+    shapes = _solved(job, sample) if single else stack_on_sky(job, sample)
+    if shapes.n_excluded:
         warnings.warn(
-            f"{stack.n_excluded} of {n_gal} stamps left out of the stack: blank, not finite, or "
-            "without a PSF, centroid or flux to use",
+            f"{shapes.n_excluded} of {n_gal} stamps left out of the stack: blank, not finite, or "
+            "without a PSF, Jacobian, centroid or flux to use",
             FdntWarning,
             stacklevel=2,
         )
-    return _estimate(stack, shapes)
-
-
-def _on_sky(xp: ModuleType, stamps: Array, psf: Psf, jacobian: Array) -> Psf:
-    """Return the PSF with weights that are round on the sky."""
-    frame = sky_frame(xp, stamps, int(stamps.shape[0]), jacobian)
-    if jacobian.ndim != 2:
-        raise ShapeMismatchError(
-            f"jacobian must have the shape (2, 2), one for all of a stack, not "
-            f"{tuple(jacobian.shape)}"
-        )
-    return frame.seen_by(psf)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Sample:
-    """What is to be stacked, and how; `centres` (n_gal, 2) count from the middle."""
-
-    stamps: Array
-    weights: Array
-    centres: Array | None
-    normalise: bool
-    n_groups: int
-    chunks: list[Chunk]
-
-    def members(self, rows: Rows) -> Array:
-        """Return which group each of the rows is in, as 0 and 1; shape (n_groups, n_rows)."""
-        xp = array_namespace(stamps=self.stamps)
-        like = {"dtype": xp.int64, "device": device_of(self.stamps)}
-        row = xp.arange(rows.start, rows.stop, **like) if isinstance(rows, slice) else rows
-        group = row * self.n_groups // int(self.stamps.shape[0])
-        number = xp.arange(self.n_groups, **like)
-        return xp.astype(group[None, :] == number[:, None], self.stamps.dtype)
+    return _estimate(shapes)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,7 +195,7 @@ class _Stack:
         )
 
 
-def _solved(job: Job, weight: Weight, sample: _Sample) -> tuple[_Stack, ShapeResult]:
+def _solved(job: Job, sample: StackSample) -> StackShapes:
     """Stack and measure until the centroids are those of the shear that is found.
 
     The null of a dipole under a weight that is round on the image does not follow the
@@ -230,18 +204,14 @@ def _solved(job: Job, weight: Weight, sample: _Sample) -> tuple[_Stack, ShapeRes
     """
     xp = array_namespace(stamps=sample.stamps)
     enough = _MOVED_LEAST[sample.stamps.dtype == xp.float32]
+    weight = _common_weight(job)
     shear = xp.zeros_like(sample.weights[:2])
     for _ in range(_PASSES):
         stack = reduce(
             _Stack.plus,
             (_stacked(job.of(part), weight, sample, part.rows, shear) for part in sample.chunks),
         )
-        n_filled = count_true(stack.weight > 0)
-        if stack.n_used < 2 or n_filled < 2:
-            raise FdntValueError(
-                f"{stack.n_used} usable stamps in {n_filled} groups ({stack.n_excluded} left "
-                "out); a mean with an error needs two of each"
-            )
+        refuse_too_few(stack.weight, stack.n_used, stack.n_excluded)
         ny, nx = sample.stamps.shape[1:]
         shapes = _measure_means(job, weight, stack, (int(ny), int(nx)))
         if not bool(shapes.measured[0]):
@@ -251,60 +221,37 @@ def _solved(job: Job, weight: Weight, sample: _Sample) -> tuple[_Stack, ShapeRes
         shear = shapes.eta[0, :]
         if sample.centres is not None or moved <= enough:
             break
-    return stack, shapes
+    return StackShapes(
+        eta=shapes.eta,
+        measured=shapes.measured,
+        weight=stack.weight,
+        n_used=stack.n_used,
+        n_excluded=stack.n_excluded,
+    )
 
 
-def _stacked(job: Job, weight: Weight, sample: _Sample, rows: Rows, shear: Array) -> _Stack:
+def _stacked(job: Job, weight: Weight, sample: StackSample, rows: Rows, shear: Array) -> _Stack:
     """Sum a chunk of galaxies, each moved to its centroid, by groups."""
-    stamps, flags = screen(rows_of(sample.stamps, rows), job.psf)
-    xp = array_namespace(stamps=stamps)
-    usable = flags == 0
-    grid = job.coarse
-    galaxies = deconvolve(stamps, job.psf.inverse_transfer(grid), grid)
+    xp = array_namespace(shear=shear)
+    grid, wide = job.coarse, None
     if sample.centres is None:
-        side = min(stamps.shape[1:])
-        wide = wide_weight(weight, grid, side, shear)
-        centres = _find_centres(job, wide, galaxies, 0.5 * side)
-    else:
-        given = rows_of(sample.centres, rows)
-        finite = xp.isfinite(given[:, 0]) & xp.isfinite(given[:, 1])
-        usable = usable & finite
-        centres = xp.where(finite[:, None], given, xp.zeros_like(given))
-    re, im = galaxies.shifted(grid, centres)
-    weights = rows_of(sample.weights, rows)
-    if sample.normalise:
-        flux = xp.sum(xp.sum(stamps, axis=-1), axis=-1)
-        usable = usable & (flux > 0)
-        weights = weights / xp.where(flux > 0, flux, xp.ones_like(flux))
-    weights = xp.where(usable, weights, xp.zeros_like(weights))
-    counted = sample.members(rows) * weights[None, :]
+        wide = wide_weight(weight, grid, min(sample.stamps.shape[1:]), shear)
+    seen = sample.centred(job, rows, wide)
+    re, im = seen.galaxies.shifted(grid, seen.centres)
+    counted = sample.members(rows) * seen.weights[None, :]
     return _Stack(
         re=xp.matmul(counted, re),
         im=xp.matmul(counted, im),
         weight=xp.sum(counted, axis=1),
-        n_used=count_true(weights > 0),
-        n_excluded=count_true(~usable),
+        n_used=count_true(seen.weights > 0),
+        n_excluded=count_true(~seen.usable),
     )
 
 
-def _find_centres(job: Job, wide: Array, galaxies: DeconvolvedStamps, reach: float) -> Array:
-    """Return the null of the dipole under a wide weight, pixels from the middle, (n_gal, 2).
-
-    Where there is none near the first centroid, that.
-    """
-    xp = array_namespace(re=galaxies.re)
-    start = starting_centroid(job.coarse, galaxies, wide, job.length, reach=reach)
-    tests = DipoleTests(grid=job.coarse, galaxies=galaxies, weight=wide, length=job.length)
-    root = find_root(tests, start / job.length, options=DoglegOptions(max_radius=8.0))
-    found = job.length * root.x
-    near = xp.all(xp.abs(found - start) <= job.length, axis=-1)
-    return xp.where((root.success & near)[:, None], found, start)
-
-
-def _estimate(stack: _Stack, shapes: ShapeResult) -> ShearEstimate:
+def _estimate(shapes: StackShapes) -> ShearEstimate:
     """Return the shear of the whole stack, row 0, with the jackknife's error from the rest."""
     xp = array_namespace(eta=shapes.eta)
-    filled = stack.weight > 0
+    filled = shapes.weight > 0
     n_filled = count_true(filled)
     g = reduced_shear_from_eta(shapes.eta)
     # A group without weight leaves the stack as it is: it is no sample.
@@ -314,13 +261,13 @@ def _estimate(stack: _Stack, shapes: ShapeResult) -> ShearEstimate:
     deviation = xp.where(inside, deviation - xp.sum(deviation, axis=0) / n_filled, deviation)
     variance = xp.sum(deviation**2, axis=0) * ((n_filled - 1.0) / n_filled)
     if not bool(xp.all(shapes.measured[1:])):
-        warnings.warn("the stack without one of its groups has no shape", FdntWarning, stacklevel=4)
+        warnings.warn("the stack without one of its groups has no shape", FdntWarning, stacklevel=3)
     return ShearEstimate(
         g=g[0, :],
         g_err=xp.sqrt(variance),
-        n_used=stack.n_used,
+        n_used=shapes.n_used,
         method="stack",
-        n_excluded=stack.n_excluded,
+        n_excluded=shapes.n_excluded,
     )
 
 

@@ -1,4 +1,4 @@
-"""A challenge measured by a Dask cluster: the same results, whatever becomes of a worker."""
+"""Measured by a Dask cluster: the same results, whatever becomes of a worker."""
 
 from __future__ import annotations
 
@@ -12,13 +12,21 @@ import time
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
+from astropy.table import Table
+from click.testing import CliRunner
 
-from challenges import CELL, run, same_result, write_challenge
+from challenges import CELL, run, same_result, set_stamps, write_challenge
+from fdnt_xp.app import parts
+from fdnt_xp.app.cli import main
 from fdnt_xp.app.great08_measure import MeasureOptions
 from fdnt_xp.app.great08_run import measure_challenge
 from fdnt_xp.app.workers import Failure, open_workers
+from fdnt_xp.data.catalog import read_catalog
+from fdnt_xp.data.images import write_image
 from fdnt_xp.errors import FdntValueError, MissingExtraError
+from images import star
 
 distributed = pytest.importorskip("distributed")
 dask = pytest.importorskip("dask")
@@ -60,10 +68,53 @@ def measure(scheduler: str, code: int = 0) -> str:
     return run("measure", "DIR", "-o", "OUT", "--cell", CELL, "--scheduler", scheduler, code=code)
 
 
+def fdnt_xp(*arguments: object) -> None:
+    result = CliRunner().invoke(main, [str(argument) for argument in arguments])
+    assert result.exit_code == 0, result.output
+
+
+def same_columns(one: Table, other: Table) -> None:
+    assert one.colnames == other.colnames
+    for name in one.colnames:
+        np.testing.assert_array_equal(one[name], other[name])
+
+
 def test_a_cluster_gives_the_same(cluster, folder, made):
     assert "3 measured, 0 failed" in measure(cluster.scheduler_address)
     same_result(Path("OUT"), made / "HERE")
     assert "0 measured, 3 before" in measure(cluster.scheduler_address)
+
+
+@pytest.fixture
+def cube(tmp_path, monkeypatch):
+    """A working directory with `cube.fits` and `psf.fits`."""
+    monkeypatch.chdir(tmp_path)
+    write_image(set_stamps(1).reshape(-1, CELL, CELL), Path("cube.fits"))
+    write_image(star((CELL, CELL)), Path("psf.fits"))
+    return tmp_path
+
+
+@pytest.mark.parametrize("kind", [(), ("--responses",)], ids=str)
+def test_a_catalog_by_a_cluster_is_the_same(kind, cluster, cube):
+    command = ("cube.fits", "--psf", "psf.fits", "--chunk", 4, "--quiet", *kind)
+    fdnt_xp("measure", *command, "-o", "here.fits")
+    # More parts than workers: files are found from wherever a worker is.
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(parts, "PART", 8)
+        fdnt_xp("measure", *command, "-o", "there.fits", "--scheduler", cluster.scheduler_address)
+    same_columns(read_catalog("here.fits"), read_catalog("there.fits"))
+    assert not Path("there.fits.parts").exists()
+
+
+def test_objects_of_a_meds_file_by_a_cluster(cluster, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    meds_files = pytest.importorskip("meds_files")  # which needs GalSim
+    cutouts = meds_files.drawn_cutouts()
+    meds_files.write_meds(Path("tile.fits"), meds_files.objects_of(cutouts))
+    command = ("measure-exposures", "tile.fits", "--chunk", 2, "--quiet")
+    fdnt_xp(*command, "-o", "here.fits")
+    fdnt_xp(*command, "-o", "there.fits", "--scheduler", cluster.scheduler_address)
+    same_columns(read_catalog("here.fits"), read_catalog("there.fits"))
 
 
 def test_a_bad_set_is_reported_and_resumed(cluster, folder, made):
