@@ -342,7 +342,7 @@ def test_a_catalog_with_a_model_is_that_with_its_stars(kind, folder):
         np.testing.assert_allclose(table[name], same[name], rtol=1e-9, atol=1e-12)
     assert table.meta["PSFMODEL"] == "psfex"
     assert "PSFMODEL" not in same.meta
-    assert len(np.unique(table["psf_size"])) == 2
+    assert len(np.unique(np.round(table["psf_size"], 9))) == 2
     if not kind:
         np.testing.assert_allclose(table["e1"], -0.1, atol=0.01)
         np.testing.assert_allclose(table["e2"], 0.2, atol=0.01)

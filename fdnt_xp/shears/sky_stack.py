@@ -13,8 +13,8 @@ from typing import Final
 
 from fdnt_xp.arrays import Array, array_namespace, count_true, device_of
 from fdnt_xp.errors import FdntValueError
-from fdnt_xp.nulltests.dogleg import newton_step
 from fdnt_xp.nulltests.scaled import scaled_tests
+from fdnt_xp.nulltests.small_systems import newton_step
 from fdnt_xp.nulltests.tests import NullTests
 from fdnt_xp.nulltests.values import MatchedWidth, TestValues
 from fdnt_xp.nulltests.weights import Weight
