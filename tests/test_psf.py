@@ -271,6 +271,43 @@ def test_take_reorders_and_repeats(three, xp, dtype, to_xp):
     assert (taken.oversampling, taken.largest_kmax) == (stack.oversampling, stack.largest_kmax)
 
 
+@pytest.mark.parametrize("shape", [(6, 8), (7, 6), (5, 7)], ids=str)
+@pytest.mark.parametrize("unit", [None, [[0.9, 0.2], [-0.1, 1.1]]], ids=["pixels", "sky"])
+def test_power_on_circles_is_that_of_direct_sums(shape, unit, dtype, to_xp, to_np):
+    # Points of a circle and their mirror images, waves by parity: nothing of it may show.
+    images = np.random.default_rng(3).standard_normal((3, *shape))
+    frame = None if unit is None else to_xp(np.broadcast_to(unit, (3, 2, 2)).copy(), dtype)
+    radii = np.array([[0.0, 0.7, 2.9]])
+    power = circles.power_on_circles(
+        to_xp(images, dtype), to_xp(np.repeat(radii, 3, axis=0), dtype), 4, 1.5, frame
+    )
+    angle = np.pi * (np.arange(4) + 0.5) / 4
+    sky = np.stack([radii[0, :, None] * np.cos(angle), radii[0, :, None] * np.sin(angle)])
+    k = np.tensordot(np.eye(2) if unit is None else np.transpose(unit), sky, axes=1)
+    y, x = (np.indices(shape) - 0.5 * (np.array(shape) - 1)[:, None, None]) / 1.5
+    waves = np.exp(-1j * (k[0][..., None, None] * x + k[1][..., None, None] * y))
+    expected = np.abs(np.einsum("nyx,raxy->nra", images, np.swapaxes(waves, -1, -2))) ** 2
+    rtol = 1e-10 if "64" in str(dtype) else 1e-4
+    np.testing.assert_allclose(to_np(power), expected, rtol=rtol, atol=rtol)
+
+
+def test_psfs_of_any_width_are_what_they_are_alone(dtype, to_xp, to_np):
+    # They share the circles on which they are summed up, by their width.
+    stars = np.stack(
+        [gaussian_image(gaussian_covariance((0.1, 0.0), s), (40, 41)) for s in (0.8, 3.5, 1.5, 1.6)]
+    )
+    together = Psf.from_image(to_xp(stars, dtype), floor=FLOOR)
+    tol = 1e-12 if "64" in str(dtype) else 1e-5
+    for row, star in enumerate(stars):
+        alone = Psf.from_image(to_xp(star, dtype), floor=FLOOR)
+        for name in ("kmax", "ln_power"):
+            one, other = to_np(getattr(together, name))[row], to_np(getattr(alone, name))[0]
+            np.testing.assert_allclose(one, other, rtol=tol, atol=tol, err_msg=name)
+    np.testing.assert_allclose(
+        to_np(together.kmax)[1], 1.5 / 3.5 * to_np(together.kmax)[2], rtol=1e-3
+    )
+
+
 def test_a_higher_floor_ends_the_weight_where_the_power_falls_below(three, dtype, to_np):
     _, psf = three
     higher = psf.ending_at(0.03)

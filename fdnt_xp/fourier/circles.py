@@ -2,7 +2,8 @@
 
 `𝒯(k) = <|T|^-2>_θ^-1` (B10, eq. 21, with the exponent corrected; docs, "Weight of the
 PSF") ends at `kmax`, where it falls below a floor or the grid ends, and it ends smoothly: a hard
-edge costs 1e-4 in e. `|T|²` is evaluated by direct trigonometric sums, exact at any k.
+edge costs 1e-4 in e. T is evaluated by direct trigonometric sums, exact at any k, on circles
+that PSFs share, and interpolated from there.
 """
 
 from __future__ import annotations
