@@ -184,7 +184,7 @@ def solve_objects(
             inverse_transfer,
             xp.take(flags, rows, axis=0) + int(Flag.FINE_GRID),
             max_iter=some.job.max_iter,
-            known=root.take(rows),
+            start=xp.take(root.x, rows, axis=0),
         )
         parts.append(again)
     merged = ObjectShapes.concat([*parts, result.take(order[n_fine:])])
@@ -198,13 +198,13 @@ def _solved_on(
     flags: Array,
     *,
     max_iter: int,
-    known: RootResult | None = None,
+    start: Array | None = None,
 ) -> tuple[ObjectShapes, RootResult]:
     """Solve objects on one grid, but for two Newton steps, the second from tests with noise."""
     xp = array_namespace(flags=flags)
     job, exposures = objects.job, tests.exposures
-    start = round_start(objects.look.offset, job.length)
-    root = stepped(search(tests, start, known, max_iter=max_iter, near=one_step_off(start)))
+    start = round_start(objects.look.offset, job.length) if start is None else start
+    root = stepped(search(tests, start, max_iter=max_iter, near=one_step_off(start)))
     eta, centroid = tests.on_stamps(root.x)
     stamps, widths = tests.stamps, None
     if exposures.n_each > 1 and tests.fixed_width is None:

@@ -44,7 +44,7 @@ from fdnt_xp.shapes.search import (
     looked_at,
     one_step_off,
     rough_root,
-    solve,
+    search,
     squeezed,
     stepped,
 )
@@ -269,7 +269,8 @@ def _measure_source(job: Job, source: Source, pixels: Pixels, flags: Array) -> S
         rows = order[start : min(start + per_chunk, n_fine)]
         reasons = xp.take(flags, rows, axis=0) + int(Flag.FINE_GRID)
         again, _, _ = _measure_on(
-            job.take(rows), job.fine, source.take(rows), shape, reasons, known=root.take(rows)
+            *(job.take(rows), job.fine, source.take(rows), shape, reasons),
+            start=xp.take(root.x, rows, axis=0),
         )
         parts.append(again)
     merged = ShapeResult.concat([*parts, result.take(order[n_fine:])])
@@ -284,14 +285,14 @@ def _measure_on(
     flags: Array,
     *,
     near: float | None = None,
-    known: RootResult | None = None,
+    start: Array | None = None,
 ) -> tuple[ShapeResult, RootResult, Array]:
     """Measure on one grid; return shapes, roots, and which a finer grid should measure again.
 
-    Roots that are `known`, of a coarser grid, are where the search starts. It ends where the
-    tests are below `near`, by default where one Newton step is enough. Two are taken: the
-    first without an evaluation of its own, as the noise evaluates the tests there anyhow, and
-    the second from there. Where that is a long one, there is no success.
+    The search begins at `start`, by default near the root under a rougher weight. It ends
+    where the tests are below `near`, by default where one Newton step is enough. Two are
+    taken: the first without an evaluation of its own, as the noise evaluates the tests there
+    anyhow, and the second from there. Where that is a long one, there is no success.
     """
     xp = array_namespace(flags=flags)
     inverse_transfer = job.psf.inverse_transfer(grid)
@@ -300,11 +301,9 @@ def _measure_on(
     tests = NullTests(
         grid=grid, galaxies=galaxies, weight=job.weight, length=job.length, fixed_width=fixed
     )
-    side = min(stamp_shape)
-    if known is None:
-        known = rough_root(job, tests, side)
-    near = one_step_off(galaxies.re) if near is None else near
-    root = stepped(solve(job, tests, side, known, near=near))
+    start = rough_root(job, tests, min(stamp_shape)) if start is None else start
+    near = one_step_off(start) if near is None else near
+    root = stepped(search(tests, start, max_iter=job.max_iter, near=near))
     eta, centroid = solution_of(tests, root)
     noise = source.noise(tests, eta, centroid, inverse_transfer)
     root = looked_at(root, *tests.scaled(eta, noise.tests, noise.matched))

@@ -27,7 +27,7 @@ from fdnt_xp.shear import eta_from_matrix, shear_matrix
 
 FINE_ABOVE: Final = 1.5
 """`|eta|` beyond which the weight, squeezed by `exp(-|eta|/2)`, covers few cells of the k grid."""
-COARSE_STEPS: Final = 12
+COARSE_STEPS: Final = 20
 """Steps of the root finder on the coarse grid: who converges there needs seldom more than 8."""
 
 _ROUGH_STEPS: Final = 6
@@ -49,44 +49,29 @@ _ROUNDING: Final = 10.0
 """Times ftol: tests that vanish, where a Jacobian is too small for a short step."""
 
 
-def solve(
-    job: Job,
-    tests: NullTests,
-    side: int,
-    known: RootResult | None = None,
-    *,
-    near: float | None = None,
-) -> RootResult:
-    """Find the root of the null tests, from one nearby or a round galaxy at its first centroid.
+def first_guess(job: Job, tests: NullTests, side: int) -> Array:
+    """Return the unknowns of round galaxies at their first centroids; `side` is of the stamps."""
+    wide = wide_weight(job.weight, tests.grid, side)
+    centre = starting_centroid(tests.grid, tests.galaxies, wide, job.length, reach=0.5 * side)
+    return round_start(centre, job.length)
 
-    Parameters
-    ----------
-    side : int
-        Of the stamps, pixels.
-    known, near
-        As for `search`.
+
+def rough_root(job: Job, tests: NullTests, side: int) -> Array:
+    """Return the root under a weight that ends early, or the first guess; shape (n_gal, 4).
+
+    It is cheap to find on few of the modes, and next to that which is wanted.
     """
-    xp = array_namespace(kmax=job.weight.kmax)
-    # A host read: where all are known, nothing else is asked for.
-    if known is not None and bool(xp.all(known.success)):
-        start = known.x
-    else:
-        wide = wide_weight(job.weight, tests.grid, side)
-        centre = starting_centroid(tests.grid, tests.galaxies, wide, job.length, reach=0.5 * side)
-        start = round_start(centre, job.length)
-    return search(tests, start, known, max_iter=job.max_iter, near=near)
-
-
-def rough_root(job: Job, tests: NullTests, side: int) -> RootResult | None:
-    """Return the roots under a weight that ends early: cheap, and next to those that are wanted."""
     if job.rough is None:
-        return None
+        return first_guess(job, tests, side)
     n_k = tests.grid.n_inside(job.rough_kmax)
     rough = replace(
         tests, grid=tests.grid.inner(n_k), galaxies=tests.galaxies.inner(n_k), weight=job.rough
     )
-    few = replace(job, weight=job.rough, max_iter=min(job.max_iter, _ROUGH_STEPS))
-    return stepped(solve(few, rough, side, near=_ROUGH_TESTS), _LONGEST_ROUGH)
+    guess = first_guess(replace(job, weight=job.rough), rough, side)
+    few = min(job.max_iter, _ROUGH_STEPS)
+    root = stepped(search(rough, guess, max_iter=few, near=_ROUGH_TESTS), _LONGEST_ROUGH)
+    xp = array_namespace(guess=guess)
+    return xp.where(root.success[:, None], root.x, guess)
 
 
 def round_start(centroid: Array, length: float) -> Array:
@@ -96,12 +81,7 @@ def round_start(centroid: Array, length: float) -> Array:
 
 
 def search(
-    tests: RootProblem,
-    start: Array,
-    known: RootResult | None = None,
-    *,
-    max_iter: int,
-    near: float | None = None,
+    tests: RootProblem, start: Array, *, max_iter: int, near: float | None = None
 ) -> RootResult:
     """Find the root of null tests in `(eta1, eta2, x0/L, y0/L)`.
 
@@ -109,17 +89,11 @@ def search(
     ----------
     tests : RootProblem
     start : array, shape (n_gal, 4)
-    known : RootResult, optional
-        Roots nearby, of a coarser grid or a rougher weight: where they are, the search starts
-        there.
     max_iter : int
         Steps.
     near : float, optional
         What the tests may be at the end of the search; by default they vanish.
     """
-    xp = array_namespace(start=start)
-    if known is not None:
-        start = xp.where(known.success[:, None], known.x, start)
     options = DoglegOptions(
         ftol=near, max_iter=max_iter, initial_radius=1.0, max_radius=3.0, patience=_PATIENCE
     )

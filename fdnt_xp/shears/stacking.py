@@ -39,7 +39,7 @@ from fdnt_xp.shapes.job import (
     prepare,
 )
 from fdnt_xp.shapes.results import ShapeResult
-from fdnt_xp.shapes.search import solve
+from fdnt_xp.shapes.search import first_guess, search
 from fdnt_xp.shapes.sky import sky_frame
 from fdnt_xp.shapes.solution import describe
 from fdnt_xp.shear import reduced_shear_from_eta
@@ -285,7 +285,8 @@ def _measure_means(
 
     galaxies = DeconvolvedStamps(re=means(stack.re), im=means(stack.im))
     tests = NullTests(grid=job.coarse, galaxies=galaxies, weight=weight, length=job.length)
-    root = solve(replace(job, weight=weight), tests, min(stamp_shape))
+    guess = first_guess(replace(job, weight=weight), tests, min(stamp_shape))
+    root = search(tests, guess, max_iter=job.max_iter)
     unknown = xp.full_like(galaxies.re[:, 0], float("nan"))
     return describe(
         tests,
