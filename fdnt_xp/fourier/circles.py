@@ -94,7 +94,7 @@ def _on_own_circles(
     """Return `|T|²` on the circles `kmax t`, interpolated from circles that PSFs share.
 
     Most of the sums over a star are the waves, which on shared circles are made once. These end
-    at the next of `reach 2^(-i/2)`: where, and so the result, depends on no other PSF.
+    at the next of `reach 2^(-i/8)`: where, and so the result, depends on no other PSF.
 
     Parameters
     ----------
@@ -102,8 +102,8 @@ def _on_own_circles(
         Radius of the largest circle on the grid.
     """
     xp = array_namespace(image=image)
-    steps = xp.floor(2.0 * xp.log2(reach / kmax))
-    ends = reach * 2.0 ** (-0.5 * steps)
+    steps = xp.floor(8.0 * xp.log2(reach / kmax))
+    ends = reach * 2.0 ** (-0.125 * steps)
     # A host read: how many PSFs share circles decides the size of their batch.
     _, group = np.unique(to_numpy(steps), return_inverse=True)
     group = group if unit is None else np.zeros_like(group)

@@ -30,6 +30,8 @@ from fdnt_xp.nulltests.forms import seen_through
 _QUADRATURE: Final = 96
 """Gauss-Legendre nodes of the integrals over k in the size equation."""
 _WIDTH_NODES: Final = 129
+_LEAST_POSITION: Final = 1e-30
+"""In the table of widths, whose root may be divided by and is far below any that matters."""
 _NODES: Final = 257
 """Of the table that is inverted."""
 _NEWTON_STEPS: Final = 4
@@ -50,8 +52,8 @@ class WidthTable:
     Parameters
     ----------
     part : CubicTable
-        `kmax² sigma²` over the table's range, as a function of where `kmax²/<k²>` is in its
-        range (both mapped to [0, 1]), for s = 1.
+        `kmax² sigma²` over the table's range, as a function of the root of where `kmax²/<k²>`
+        is in its range (both mapped to [0, 1]), for s = 1: small widths need the finer nodes.
     width_range, square_range : array, shape (n_psf, 2)
         The ranges of `kmax² sigma²` and `kmax²/<k²>`.
     """
@@ -186,7 +188,9 @@ class Weight:
         position = (inverse_square * unit - low) / (high - low)
         at_bound = (position <= 0) | (position >= 1)
         inside = xp.minimum(xp.maximum(position, xp.zeros_like(unit)), xp.ones_like(unit))
-        value, slope = self.widths.part.evaluate(inside, self._rows(int(unit.shape[0])))
+        root = xp.sqrt(inside + _LEAST_POSITION)
+        value, slope = self.widths.part.evaluate(root, self._rows(int(unit.shape[0])))
+        slope = slope / (2.0 * root)
         narrow, wide = width_range[:, 0], width_range[:, 1]
         width = (narrow + value * (wide - narrow)) / unit
         slope = slope * (wide - narrow) / (high - low)
@@ -232,8 +236,8 @@ def _width_table(psf: Psf, largest_size: float) -> WidthTable:
     square_ends, _ = by_width.inverse_mean_square(ends, row)
     fraction = xp.linspace(0.0, 1.0, _WIDTH_NODES, **like)[None, :]
     low, high = square_ends[:, 0:1], square_ends[:, 1:2]
-    wanted = low + fraction * (high - low)
-    width = ends[:, 0:1] + fraction * (ends[:, 1:2] - ends[:, 0:1])
+    wanted = low + fraction**2 * (high - low)
+    width = ends[:, 0:1] + fraction**2 * (ends[:, 1:2] - ends[:, 0:1])
     for _ in range(_NEWTON_STEPS):
         square, slope = by_width.inverse_mean_square(width, row)
         width = xp.maximum(width + (wanted - square) / slope, ends[:, 0:1])

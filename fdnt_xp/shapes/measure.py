@@ -158,8 +158,8 @@ def measure_shapes(
     >>> star = np.exp(-(x**2 + y**2) / 8.0)
     >>> galaxy = np.exp(-(x**2 / 18.0 + y**2 / 12.0) / 2.0)  # variances 18 and 12
     >>> shapes = fx.measure_shapes(galaxy[None], fx.Psf.from_image(star))
-    >>> shapes.e.round(6)  # before the PSF, of variance 4: (14 - 8)/(14 + 8)
-    array([[0.272727, 0.      ]])
+    >>> shapes.e[:, 0].round(6)  # before the PSF, of variance 4: (14 - 8)/(14 + 8)
+    array([0.272727])
     """
     xp, stamps = check_stamps(stamps, psf)
     n_gal = int(stamps.shape[0])
