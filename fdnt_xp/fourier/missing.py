@@ -17,7 +17,8 @@ from typing import Final
 
 from fdnt_xp.arrays import Array, array_namespace, device_of
 from fdnt_xp.fourier.grid import KGrid, half_plane_disc
-from fdnt_xp.fourier.psf import Psf, half_plane_transform
+from fdnt_xp.fourier.psf import Psf
+from fdnt_xp.fourier.star_transform import half_plane_transform
 from fdnt_xp.fourier.transform import complex_like
 
 _FLOOR: Final = 1e-4

@@ -25,7 +25,8 @@ from fdnt_xp.fourier.circles import CIRCLE_POINTS, CIRCLES, power_on_circles
 from fdnt_xp.fourier.deviates import unit_deviates
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.interpolation import cubic_table
-from fdnt_xp.fourier.psf import Psf, transform_on_modes
+from fdnt_xp.fourier.psf import Psf
+from fdnt_xp.fourier.star_transform import transform_on_modes
 from fdnt_xp.fourier.transform import DeconvolvedStamps, complex_like
 
 _DIRECTIONS: Final = 64

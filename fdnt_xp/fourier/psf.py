@@ -26,7 +26,8 @@ from fdnt_xp.fourier.circles import circle_tables, ended_at, pixels_from_middle
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.interpolation import CubicTable
 from fdnt_xp.fourier.jacobian import longest_stretch, unit_jacobian, wave_frame
-from fdnt_xp.fourier.transform import complex_like, half_plane_axes, mode_phase
+from fdnt_xp.fourier.star_transform import transform_on_modes
+from fdnt_xp.fourier.transform import mode_phase
 
 _UNIT_STEPS = 8192.0
 """Of an entry of a unit Jacobian, to one: pixels that differ by less share tables."""
@@ -65,6 +66,8 @@ class Psf:
         Where `𝒯` ends; see `from_image`.
     index : array of int64, shape (n_gal,), optional
         Which PSF each galaxy has, where several share one.
+    distinct : tuple of Psf and array of int64, shape (n_psf,), optional
+        The different ones of these PSFs, and which of those each is: they are transformed once.
     unit_jacobian : array, shape (n_psf, 2, 2), optional
         B of the galaxies' pixels (`fdnt_xp.fourier.jacobian`). With it `kmax`, `weight` and
         `ln_power` are about wave numbers on the sky, in units of pixels as large as theirs, or
@@ -82,6 +85,7 @@ class Psf:
     largest_kmax: float
     floor: float = 1e-6
     index: Array | None = None
+    distinct: tuple[Psf, Array] | None = None
     unit_jacobian: Array | None = None
 
     @classmethod
@@ -183,14 +187,37 @@ class Psf:
 
     def take(self, rows: Array) -> Psf:
         """Return the PSFs of the given galaxies (integer array), one for each."""
-        xp = array_namespace(image=self.image, rows=rows)
         numbers = self.numbers_of(rows)
+        return replace(self._numbered(numbers), distinct=self._distinct(numbers))
+
+    def _numbered(self, numbers: Array) -> Psf:
+        """Return the PSFs with the given numbers."""
+        xp = array_namespace(image=self.image, numbers=numbers)
         moved: tuple[str, ...]
         moved = ("image", "centre", "kmax", "usable", "ln_power", "circle_kmax")
         if self.unit_jacobian is not None:
             moved += ("unit_jacobian",)
         taken = {name: xp.take(getattr(self, name), numbers, axis=0) for name in moved}
-        return replace(self, **taken, weight=self.weight.take(numbers), index=None)
+        weight = self.weight.take(numbers)
+        return replace(self, **taken, weight=weight, index=None, distinct=None)
+
+    def _distinct(self, numbers: Array) -> tuple[Psf, Array] | None:
+        """Return the different ones among the PSFs with these numbers, and which each is.
+
+        None where galaxies do not share PSFs, as far as is known, or none of these do.
+        """
+        if self.index is None and self.distinct is None:
+            return None
+        xp = array_namespace(numbers=numbers)
+        psf, which = (self, numbers)
+        if self.distinct is not None:
+            psf, which = self.distinct[0], xp.take(self.distinct[1], numbers, axis=0)
+        # A host read: how many there are decides the size of their transforms.
+        found, place = np.unique(to_numpy(which), return_inverse=True)
+        if len(found) == int(numbers.shape[0]):
+            return None
+        like = {"dtype": xp.int64, "device": device_of(numbers)}
+        return psf._numbered(xp.asarray(found, **like)), xp.asarray(place, **like)
 
     def with_index(self, psf_index: Array) -> Psf:
         """Return the same PSFs for other galaxies: see `from_image`."""
@@ -293,6 +320,7 @@ class Psf:
             weight=weight,
             largest_kmax=_largest(kmax, self.unit_jacobian),
             floor=max(floor, self.floor),
+            distinct=None,
         )
 
     def transfer(self, grid: KGrid) -> Array:
@@ -314,6 +342,9 @@ class Psf:
         array, shape (n_psf, n_k), complex
         """
         xp = array_namespace(image=self.image)
+        if self.distinct is not None:
+            psf, which = self.distinct
+            return xp.take(psf.inverse_transfer(grid), which, axis=0)
         transfer = self.transfer(grid)
         kx, ky = grid.kx[None, :], grid.ky[None, :]
         frame = self.frame
@@ -323,48 +354,6 @@ class Psf:
         inside = (radius < self.kmax[:, None]) & (xp.abs(transfer) > 0)
         one = xp.ones_like(transfer)
         return xp.where(inside, one / xp.where(inside, transfer, one), xp.zeros_like(transfer))
-
-
-def transform_on_modes(image: Array, grid: KGrid, oversampling: float) -> Array:
-    """Return the transform of images, about the middle of their arrays, on a grid's modes.
-
-    Parameters
-    ----------
-    image : array, shape (n_psf, ny, nx)
-    oversampling : float
-        Pixels of `image` per pixel of the galaxies.
-
-    Returns
-    -------
-    array, shape (n_psf, n_k), complex
-    """
-    xp = array_namespace(image=image)
-    n_psf, ny, nx = (int(n) for n in image.shape)
-    fits = oversampling == 1.0 and ny <= grid.shape[0] and nx <= grid.shape[1]
-    if fits and n_psf > 0:  # PyTorch does not transform none
-        # The same sums, by a fast transform.
-        middle = xp.asarray(
-            [[0.5 * (nx - 1), 0.5 * (ny - 1)]], dtype=image.dtype, device=device_of(image)
-        )
-        half_plane = xp.fft.rfftn(image, s=grid.shape, axes=(-2, -1))
-        half_plane = xp.reshape(half_plane, (n_psf, grid.n_half_plane))
-        return xp.take(half_plane, grid.index, axis=1) * mode_phase(grid, middle)
-    return xp.take(half_plane_transform(image, grid, oversampling), grid.index, axis=1)
-
-
-def half_plane_transform(image: Array, grid: KGrid, oversampling: float) -> Array:
-    """Return the same on all modes of the grid's `rfftn`, shape (n_psf, n_half_plane).
-
-    `exp(-i k.x)` separates, `T = along_y @ image @ along_xᵀ`, so the direct sums are two
-    matrix products.
-    """
-    xp = array_namespace(image=image)
-    n_psf, ny, nx = image.shape
-    kx, ky = half_plane_axes(grid)
-    along_x, along_y = _waves(kx, nx, oversampling), _waves(ky, ny, oversampling)
-    image = xp.astype(image, along_x.dtype)
-    half_plane = xp.matmul(xp.matmul(along_y, image), xp.matrix_transpose(along_x))
-    return xp.reshape(half_plane, (n_psf, grid.n_half_plane))
 
 
 def _checked_index(xp: ModuleType, image: Array, psf_index: Array) -> Array:
@@ -408,13 +397,6 @@ def _flux_centroid(image: Array) -> Array:
     x = xp.sum(xp.sum(image, axis=1) * pixels_from_middle(nx, image), axis=-1)
     y = xp.sum(xp.sum(image, axis=2) * pixels_from_middle(ny, image), axis=-1)
     return xp.stack([x, y], axis=-1)
-
-
-def _waves(k: Array, n: int, oversampling: float) -> Array:
-    """Return `exp(-i k x)`, shape (n_k, n), x in galaxy pixels from the middle of the array."""
-    xp = array_namespace(k=k)
-    angle = k[:, None] * (pixels_from_middle(n, k) / oversampling)[None, :]
-    return xp.exp(complex_like(angle) * -1j)
 
 
 def _different(numbers: Array, matrices: Array) -> tuple[Array, Array]:

@@ -21,6 +21,7 @@ from fdnt_xp.arrays import (
     compiles_every_shape,
     device_of,
     require_dtype,
+    works_in_blocks,
 )
 from fdnt_xp.errors import FdntValueError, RangeError, ShapeMismatchError
 from fdnt_xp.nulltests.small_systems import (
@@ -300,8 +301,9 @@ def _step(
     step = _dogleg_step(xp, f, jac, radius)
     f_trial, jac_trial, inside = _evaluate(xp, problem, state.x + step)
 
-    promised = _reduction(xp, f, f + add_up(xp, jac * step[:, None, :]))
-    real = _reduction(xp, f, xp.where(inside[:, None], f_trial, f))
+    size_f = norm(xp, f)
+    promised = _reduction(xp, size_f, f + add_up(xp, jac * step[:, None, :]))
+    real = _reduction(xp, size_f, xp.where(inside[:, None], f_trial, f))
     # Written without a division: the promise may be 0.
     accept = running & inside & (promised > 0.0) & (real >= _ACCEPT * promised)
     f = xp.where(accept[:, None], f_trial, state.f)
@@ -340,6 +342,10 @@ def _step(
 def _dogleg_step(xp: ModuleType, f: Array, jac: Array, radius: Array) -> Array:
     """Return the step of length `<= radius` along the path 0 - Cauchy - Newton."""
     newton, solved = newton_step(xp, f, jac)
+    fits = solved & (norm(xp, newton) <= radius)
+    # A host read, where that waits for nothing: near a root all steps are Newton's.
+    if works_in_blocks(f) and bool(xp.all(fits)):
+        return newton
     cauchy = _cauchy_step(xp, f, jac, radius)
     # |cauchy + s u| = radius, u the direction from Cauchy to Newton; in units of the radius.
     distance = norm(xp, newton - cauchy)
@@ -351,7 +357,7 @@ def _dogleg_step(xp: ModuleType, f: Array, jac: Array, radius: Array) -> Array:
     # The form of the positive root that does not cancel; along < 0 is rounding.
     s = xp.minimum(gap / nonzero(xp, xp.abs(along) + root) * radius, distance)
     bent = xp.where(solved[:, None], cauchy + s[:, None] * unit, cauchy)
-    return xp.where((solved & (norm(xp, newton) <= radius))[:, None], newton, bent)
+    return xp.where(fits[:, None], newton, bent)
 
 
 def _cauchy_step(xp: ModuleType, f: Array, jac: Array, radius: Array) -> Array:
@@ -391,9 +397,8 @@ def _evaluate(xp: ModuleType, problem: RootProblem, x: Array) -> tuple[Array, Ar
     return f, jac, finite
 
 
-def _reduction(xp: ModuleType, f: Array, new: Array) -> Array:
-    """Return `1 - |new|²/|f|²`, cut at -3, where the ratio is still far from overflow."""
-    size = norm(xp, f)
+def _reduction(xp: ModuleType, size: Array, new: Array) -> Array:
+    """Return `1 - |new|²/size²`, cut at -3, where the ratio is still far from overflow."""
     ratio = xp.minimum(norm(xp, new), 2.0 * size) / nonzero(xp, size)
     return 1.0 - ratio * ratio
 

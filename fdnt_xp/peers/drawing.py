@@ -15,7 +15,8 @@ import numpy as np
 
 from fdnt_xp.arrays import Array, DType, array_namespace, device_of
 from fdnt_xp.fourier.grid import half_plane_disc
-from fdnt_xp.fourier.psf import Psf, half_plane_transform
+from fdnt_xp.fourier.psf import Psf
+from fdnt_xp.fourier.star_transform import half_plane_transform
 from fdnt_xp.fourier.transform import complex_like, half_plane_axes
 
 

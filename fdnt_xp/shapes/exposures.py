@@ -175,11 +175,11 @@ def _measure_batch(
     job: Job, batch: ObjectBatch, fill: int | None, n_bands: int, n_at_once: int
 ) -> _Measured:
     """Measure objects with equally many stamps: on the coarse grid, the few that need it finer."""
-    every, job = job, job.take(batch.rows)
+    job = job.take(batch.rows)
     sources, flags, missing = batch.sources(job.psf, fill)
     xp = array_namespace(flags=flags)
     shape, n_each = batch.pixels.stamp_shape, batch.exposures.n_each
-    inverse_transfer = _inverse_transfer(every, batch.rows, job)
+    inverse_transfer = job.psf.inverse_transfer(job.coarse)
     tests = stamp_tests(job, job.coarse, sources, inverse_transfer)
     seen = look(
         tests,
@@ -215,16 +215,6 @@ def _measure_batch(
         masked_fraction=xp.mean(by_object(missing, n_each), axis=1),
     )
     return _Measured(batch=batch, shapes=shapes, flags=seen.flags, snr=seen.snr)
-
-
-def _inverse_transfer(every: Job, rows: Array, job: Job) -> Array:
-    """Return 1/T of the stamps of a batch: of each PSF once where several stamps share it."""
-    psf = every.psf
-    if psf.index is None or psf.n_psf > int(rows.shape[0]):
-        return job.psf.inverse_transfer(every.coarse)
-    xp = array_namespace(rows=rows)
-    table = replace(psf, index=None).inverse_transfer(every.coarse)
-    return xp.take(table, psf.numbers_of(rows), axis=0)
 
 
 def _check_fill(transform: str, order: int, stamps: Array) -> None:
