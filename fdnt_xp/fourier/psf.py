@@ -109,7 +109,7 @@ class Psf:
         psf_index : array of integers, shape (n_gal,), optional
             Which star each galaxy has, from 0. Tables are made once for each star, and
             galaxies that share one are measured together. A hundred of them for each star take
-            about 1.6 times as long as with one PSF for all.
+            1.2 to 1.7 times as long as with one PSF for all.
         oversampling : float
             Pixels of `image` per pixel of the galaxies, along one axis. The pixel response
             in the image must be that of the galaxies' pixels.
