@@ -18,6 +18,7 @@ from fdnt_xp.shapes.results import ShapeResult
 from fdnt_xp.shapes.search import (
     COARSE_STEPS,
     FINE_ABOVE,
+    TWO_STEPS_OFF,
     looked_at,
     one_step_off,
     round_start,
@@ -161,7 +162,9 @@ def solve_objects(
     """Solve objects on the coarse grid, then the few that need it on the fine one."""
     xp = array_namespace(flags=flags)
     max_iter = min(objects.job.max_iter, COARSE_STEPS)
-    result, root = _solved_on(objects, tests, inverse_transfer, flags, max_iter=max_iter)
+    result, root = _solved_on(
+        objects, tests, inverse_transfer, flags, max_iter=max_iter, near=TWO_STEPS_OFF
+    )
     eta, _ = tests.on_stamps(root.x)
     narrow = squeezed(eta, objects.job.weight.frame) > FINE_ABOVE
     narrow = tests.exposures.total(xp.astype(narrow, eta.dtype)) > 0
@@ -198,13 +201,15 @@ def _solved_on(
     flags: Array,
     *,
     max_iter: int,
+    near: float | None = None,
     start: Array | None = None,
 ) -> tuple[ObjectShapes, RootResult]:
     """Solve objects on one grid, but for two Newton steps, the second from tests with noise."""
     xp = array_namespace(flags=flags)
     job, exposures = objects.job, tests.exposures
     start = round_start(objects.look.offset, job.length) if start is None else start
-    root = stepped(search(tests, start, max_iter=max_iter, near=one_step_off(start)))
+    near = one_step_off(start) if near is None else near
+    root = stepped(search(tests, start, max_iter=max_iter, near=near))
     eta, centroid = tests.on_stamps(root.x)
     stamps, widths = tests.stamps, None
     if exposures.n_each > 1 and tests.fixed_width is None:
