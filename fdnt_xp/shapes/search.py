@@ -1,7 +1,8 @@
 """The search for the root of the null tests: where it starts, how long it may take, its end.
 
-The noise of the tests evaluates them at the solution anyhow. So the last Newton step may be
-taken without an evaluation of its own, and looked at afterwards.
+It starts from the root under a rougher weight, on few of the modes. And it ends early: the
+noise of the tests evaluates them at the solution anyhow, so that one Newton step is taken
+without an evaluation of its own, and another from there.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from fdnt_xp.nulltests.dogleg import (
     default_ftol,
     find_root,
 )
-from fdnt_xp.nulltests.small_systems import newton_step
+from fdnt_xp.nulltests.small_systems import largest, newton_step
 from fdnt_xp.nulltests.tests import NullTests
 from fdnt_xp.shapes.centroid import starting_centroid, wide_weight
 from fdnt_xp.shapes.job import Job
@@ -109,7 +110,7 @@ def stepped(root: RootResult, longest: float = _LONGEST) -> RootResult:
     """Return roots one Newton step further on, where that is short; the tests are not looked at."""
     xp = array_namespace(x=root.x)
     step, _ = newton_step(xp, root.f, root.jac)
-    short = root.success & (xp.max(xp.abs(step), axis=-1) <= longest)
+    short = root.success & (largest(xp, step) <= longest)
     return replace(root, x=xp.where(short[:, None], root.x + step, root.x))
 
 
@@ -122,7 +123,7 @@ def looked_at(root: RootResult, f: Array, jac: Array) -> RootResult:
     xp = array_namespace(x=root.x)
     ftol = default_ftol(xp, root.x.dtype)
     step, _ = newton_step(xp, f, jac)
-    off, length = xp.max(xp.abs(f), axis=-1), xp.max(xp.abs(step), axis=-1)
+    off, length = largest(xp, f), largest(xp, step)
     short = xp.maximum(off, length) <= max(_LAST_STEP, 3.0 * math.sqrt(ftol))
     # Not `>`: the tests may be NaN.
     missed = root.success & ~(short | (off <= _ROUNDING * ftol))
