@@ -219,7 +219,9 @@ def test_many_galaxies_taken_by_their_psf(drawn):
     np.testing.assert_allclose(shapes.e, np.tile(E, (80, 1)), atol=5e-6)
 
 
-def test_nearly_equal_pixels_share_tables_and_nothing_else(drawn, monkeypatch):
+@pytest.mark.parametrize(("n", "most"), [(3, 3), (80, 9)], ids=["few", "many"])
+def test_nearly_equal_pixels_share_tables_and_nothing_else(n, most, drawn, monkeypatch):
+    # Few may have their own: no shape then depends on how alike the others are.
     _, stars = drawn
     made = []
     tables = psf_module.circle_tables
@@ -229,10 +231,11 @@ def test_nearly_equal_pixels_share_tables_and_nothing_else(drawn, monkeypatch):
         return tables(image, *args)
 
     monkeypatch.setattr(psf_module, "circle_tables", counted)
-    j = JACOBIANS[0] * (1.0 + np.array([[0.0, 2e-5], [-1e-5, 1e-5]]) * np.arange(3)[:, None, None])
+    j = JACOBIANS[0] * (1.0 + np.array([[0.0, 4e-6], [-2e-6, 2e-6]]) * np.arange(n)[:, None, None])
     seen = fx.Psf.from_image(stars[0]).through(j)
-    assert made == [1, 1]
-    assert seen.n_psf == 3
+    assert made[0] == 1
+    assert 1 <= made[1] <= most
+    assert seen.n_psf == n
     np.testing.assert_allclose(seen.unit_jacobian[seen.index], unit_jacobian(j), atol=1e-15)
 
 

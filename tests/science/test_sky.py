@@ -64,8 +64,7 @@ def test_a_galaxy_has_one_shape_through_any_pixels(name, drawn):
     # Sums over other modes of the sky: 6e-8. Jacobians rounded for the weights: 2e-7.
     np.testing.assert_allclose(shapes.eta - shapes.eta[0], 0.0, atol=1e-6)
     np.testing.assert_allclose(shapes.sky_offset, [[0.06, -0.05]] * len(JACOBIANS), atol=1e-10)
-    # With Jacobians that are not rounded: 6e-8.
-    np.testing.assert_allclose(shapes.size, shapes.size[0], rtol=2e-6)
+    np.testing.assert_allclose(shapes.size, shapes.size[0], rtol=1e-6)
     np.testing.assert_allclose(shapes.eg - shapes.eg[0], 0.0, atol=2e-6)
     if name == "exponential":
         np.testing.assert_allclose(shapes.e, [[0.3, 0.2]] * len(JACOBIANS), atol=1e-6)
