@@ -38,7 +38,9 @@ from fdnt_xp.shears.responses import measure_responses
 FFT_BLOCK: Final = 64
 """Stamps that the floor transforms at a time on a CPU, whose cache they fit."""
 FEW: Final = 64
-"""Galaxies, at most, with what takes long for each: its own PSF, a Gauss-Laguerre fit."""
+"""Galaxies, at most, with a Gauss-Laguerre fit, which takes long for each."""
+MANY_PSFS: Final = 1024
+"""Galaxies, at most, with a PSF each."""
 ON_CPU, ON_GPU = 1024, 65_536
 """Galaxies, unless told otherwise."""
 
@@ -144,7 +146,8 @@ def make_cases(stamps: BenchStamps, backend: Backend, threads: int) -> tuple[Cas
     few = min(n_gal, FEW)
     chunk = CHUNK_ON_CPU if backend.on_cpu else CHUNK_ON_GPU
     psf = Psf.from_image(backend.from_numpy(stamps.star))
-    stars = backend.from_numpy(np.broadcast_to(stamps.star, (few, *stamps.star.shape)))
+    many = min(n_gal, MANY_PSFS)
+    stars = backend.from_numpy(np.broadcast_to(stamps.star, (many, *stamps.star.shape)))
     psfs = Psf.from_image(stars)
     noise: dict[str, Any] = {"noise_variance": stamps.variance}
 
@@ -173,10 +176,10 @@ def make_cases(stamps: BenchStamps, backend: Backend, threads: int) -> tuple[Cas
     named = {
         "measure_shapes": shapes(n_gal, psf),
         "  from host memory": Case(name="", n_gal=n_gal, run=from_host),
-        "  a PSF for each": shapes(few, psfs),
+        "  a PSF for each": shapes(many, psfs),
         "  transform=gl": shapes(few, psf, transform="gl"),
         "Psf.from_image for each": Case(
-            name="", n_gal=few, run=lambda: _fraction(Psf.from_image(stars).usable)
+            name="", n_gal=many, run=lambda: _fraction(Psf.from_image(stars).usable)
         ),
         "population_null": null(),
         "  isotropise=False": null(isotropise=False),

@@ -113,7 +113,7 @@ HOW = options(
         "--chunk",
         type=click.IntRange(min=1),
         metavar="N",
-        help="Galaxies at a time; bounds the memory. [default: 256, on a GPU 8192]",
+        help="Galaxies at a time; bounds the memory. [default: 1024, on a GPU 8192]",
     ),
     click.option("-q", "--quiet", is_flag=True, help="No progress bar and no summary."),
 )

@@ -76,7 +76,7 @@ from fdnt_xp.data.meds_index import CUTOUTS
     "--chunk",
     type=click.IntRange(min=1),
     metavar="N",
-    help="Objects at a time, at most. [default: 256, on a GPU 8192, and less if they are large]",
+    help="Objects at a time, at most. [default: 1024, on a GPU 8192, and less if they are large]",
 )
 @click.option("-q", "--quiet", is_flag=True, help="No progress bar and no summary.")
 @OVERWRITE
