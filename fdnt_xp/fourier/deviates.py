@@ -17,7 +17,7 @@ from typing import Final
 
 import numpy as np
 
-from fdnt_xp.arrays import Array, DType, array_namespace
+from fdnt_xp.arrays import Array, DType, array_namespace, blocks_in_cache
 
 _ROTATIONS: Final = ((13, 15, 26, 6), (17, 29, 16, 24))
 _PARITY: Final = 0x1BD11BDA
@@ -52,11 +52,17 @@ def unit_deviates(
     low, high = _words(identifiers)
     key = threefry(_seed_words(seed), (low, high))
     number = xp.astype(modes, xp.int32)[None, :]
-    first, second = threefry((key[0][:, None], key[1][:, None]), (number, xp.zeros_like(number)))
-    # |z|² is exponential, the angle uniform: Box and Muller's transform.
-    radius = xp.sqrt(-xp.log(_fraction(first, dtype)))
-    angle = (2.0 * math.pi) * _fraction(second, dtype)
-    return radius * xp.cos(angle), radius * xp.sin(angle)
+    whole = xp.broadcast_to(number, (int(low.shape[0]), int(number.shape[1])))
+    parts = []
+    for rows in blocks_in_cache(whole):
+        words = key[0][rows, None], key[1][rows, None]
+        first, second = threefry(words, (number, xp.zeros_like(number)))
+        # |z|² is exponential, the angle uniform: Box and Muller's transform.
+        radius = xp.sqrt(-xp.log(_fraction(first, dtype)))
+        angle = (2.0 * math.pi) * _fraction(second, dtype)
+        parts.append((radius * xp.cos(angle), radius * xp.sin(angle)))
+    re, im = (xp.concat(part) for part in zip(*parts, strict=True))
+    return re, im
 
 
 def threefry(key: tuple[Array, Array], counter: tuple[Array, Array]) -> tuple[Array, Array]:
