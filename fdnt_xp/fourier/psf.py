@@ -20,7 +20,14 @@ from types import ModuleType
 
 import numpy as np
 
-from fdnt_xp.arrays import Array, array_namespace, as_floating, device_of, to_numpy
+from fdnt_xp.arrays import (
+    Array,
+    array_namespace,
+    as_floating,
+    blocks_in_cache,
+    device_of,
+    to_numpy,
+)
 from fdnt_xp.errors import FdntTypeError, FdntValueError, RangeError, ShapeMismatchError
 from fdnt_xp.fourier.circles import circle_tables, ended_at, pixels_from_middle
 from fdnt_xp.fourier.grid import KGrid
@@ -350,13 +357,19 @@ class Psf:
         if self.distinct is not None:
             psf, which = self.distinct
             return xp.take(psf.inverse_transfer(grid), which, axis=0)
-        transfer = self.transfer(grid)
+        flat = xp.reshape(self.image, (self.n_psf, -1)) if self.n_psf else self.image[:, 0, :]
+        return xp.concat([self._inverse_of(rows, grid) for rows in blocks_in_cache(flat)])
+
+    def _inverse_of(self, rows: slice, grid: KGrid) -> Array:
+        """Return `1/T(k)` of few PSFs."""
+        xp = array_namespace(image=self.image)
+        transfer = transform_on_modes(self.image[rows, :, :], grid, self.oversampling)
+        transfer = transfer * mode_phase(grid, self.centre[rows, :])
         kx, ky = grid.kx[None, :], grid.ky[None, :]
-        frame = self.frame
-        if frame is not None:
+        if self.unit_jacobian is not None:
+            frame = wave_frame(self.unit_jacobian[rows, :, :])
             kx, ky = (frame[:, i, 0:1] * kx + frame[:, i, 1:2] * ky for i in (0, 1))
-        radius = xp.sqrt(kx**2 + ky**2)
-        inside = (radius < self.kmax[:, None]) & (xp.abs(transfer) > 0)
+        inside = (xp.sqrt(kx**2 + ky**2) < self.kmax[rows, None]) & (xp.abs(transfer) > 0)
         one = xp.ones_like(transfer)
         return xp.where(inside, one / xp.where(inside, transfer, one), xp.zeros_like(transfer))
 
