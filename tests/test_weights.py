@@ -192,9 +192,10 @@ def test_the_weight_of_a_stack_is_that_of_its_psfs(xp, dtype, each, to_xp):
     inverse = to_xp([5.0], dtype)
     for i, star in enumerate(STARS):
         alone = make_weight(Psf.from_image(to_xp(star, dtype), floor=FLOOR), LARGEST)
-        row = each.take(to_xp([i]))
+        row = each.take(to_xp([1 - i, i])).only(to_xp([1]))
         assert alone.shared
         assert row.shared
+        assert not each.take(to_xp([i])).shared
         tol = tolerance("sums", dtype)
         for ours, theirs in zip(
             (*row.psf_factor(square, shrink), *row.matched_width(inverse, shrink)[:2]),

@@ -54,7 +54,7 @@ class WidthTable:
     part : CubicTable
         `kmax² sigma²` over the table's range, as a function of the root of where `kmax²/<k²>`
         is in its range (both mapped to [0, 1]), for s = 1: small widths need the finer nodes.
-    width_range, square_range : array, shape (n_psf, 2)
+    width_range, square_range : array, shape (n_psf or n_gal, 2)
         The ranges of `kmax² sigma²` and `kmax²/<k²>`.
     """
 
@@ -63,9 +63,9 @@ class WidthTable:
     square_range: Array
 
     def take(self, rows: Rows) -> WidthTable:
-        """Return the tables with the given row numbers."""
-        return WidthTable(
-            part=self.part.take(rows),
+        """Return the ranges of the given galaxies, with all tables."""
+        return replace(
+            self,
             width_range=rows_of(self.width_range, rows),
             square_range=rows_of(self.square_range, rows),
         )
@@ -80,30 +80,43 @@ class Weight:
     psf_part : CubicTable
         `𝒯` as a function of `k/kmax`. (Not of its square, which would take no root: many are
         not smooth in k² at 0, and a table of that costs accuracy.)
-    kmax : array, shape (n_psf,)
+    kmax : array, shape (n_psf or n_gal,)
         Where `𝒯` ends, rad/pixel.
     widths : WidthTable, optional
         What `matched_width` needs.
-    frame : array, shape (n_psf, 2, 2), optional
+    frame : array, shape (n_psf or n_gal, 2, 2), optional
         A: the weight is a function of `|A k|`, the wave number on the sky. That of the
         pixels without it.
+    index : array of int64, shape (n_gal,), optional
+        Which of the tables each galaxy has. Without it there is one for all, or one for each.
     """
 
     psf_part: CubicTable
     kmax: Array
     widths: WidthTable | None = None
     frame: Array | None = None
+    index: Array | None = None
 
     def take(self, rows: Rows) -> Weight:
-        """Return the weights with the given row numbers; a shared one stays."""
+        """Return the weights of the given galaxies, with all tables; a shared one stays."""
         if self.shared:
             return self
-        return Weight(
-            psf_part=self.psf_part.take(rows),
+        return replace(
+            self,
             kmax=rows_of(self.kmax, rows),
             widths=None if self.widths is None else self.widths.take(rows),
             frame=None if self.frame is None else rows_of(self.frame, rows),
+            index=rows_of(self._numbers, rows),
         )
+
+    def only(self, row: Array) -> Weight:
+        """Return the weight of one galaxy, shape (1,), to be shared by others."""
+        one = self.take(row)
+        widths = one.widths
+        if widths is not None and one.index is not None:
+            widths = replace(widths, part=widths.part.take(one.index))
+        part = one.psf_part if one.index is None else one.psf_part.take(one.index)
+        return replace(one, psf_part=part, widths=widths, index=None)
 
     def shrunk(self, factor: float) -> Weight:
         """Return the weights with their discs smaller by a factor, `kmax/factor`.
@@ -115,7 +128,15 @@ class Weight:
     @property
     def shared(self) -> bool:
         """Whether one weight serves all galaxies."""
-        return int(self.kmax.shape[0]) == 1
+        return self.index is None and int(self.kmax.shape[0]) == 1
+
+    @property
+    def _numbers(self) -> Array:
+        """Which table each galaxy has."""
+        if self.index is not None:
+            return self.index
+        xp = array_namespace(kmax=self.kmax)
+        return xp.arange(int(self.kmax.shape[0]), dtype=xp.int64, device=device_of(self.kmax))
 
     def psf_factor(self, square: Array, shrink: Array) -> tuple[Array, Array]:
         """Return `𝒯(s sqrt(q))` and its derivative by q.
@@ -132,7 +153,7 @@ class Weight:
         # At k = 0 the derivative only ever meets factors of q: any finite number will do.
         t = xp.sqrt(xp.abs(square) + _LEAST_SQUARE)
         t *= scale
-        value, slope = self.psf_part.evaluate(t, self._rows(int(square.shape[0])))
+        value, slope = self.psf_part.evaluate(t, None if self.shared else self._numbers)
         slope /= t
         slope *= 0.5 * scale**2
         return value, slope
@@ -189,19 +210,12 @@ class Weight:
         at_bound = (position <= 0) | (position >= 1)
         inside = xp.minimum(xp.maximum(position, xp.zeros_like(unit)), xp.ones_like(unit))
         root = xp.sqrt(inside + _LEAST_POSITION)
-        value, slope = self.widths.part.evaluate(root, self._rows(int(unit.shape[0])))
+        value, slope = self.widths.part.evaluate(root, None if self.shared else self._numbers)
         slope = slope / (2.0 * root)
         narrow, wide = width_range[:, 0], width_range[:, 1]
         width = (narrow + value * (wide - narrow)) / unit
         slope = slope * (wide - narrow) / (high - low)
         return width, xp.where(at_bound, xp.zeros_like(slope), slope), at_bound
-
-    def _rows(self, n_gal: int) -> Array | None:
-        """Return which table each galaxy uses, or None for the only one."""
-        if self.shared:
-            return None
-        xp = array_namespace(kmax=self.kmax)
-        return xp.arange(n_gal, dtype=xp.int64, device=device_of(self.kmax))
 
 
 def make_weight(psf: Psf, largest_size: float | None = None) -> Weight:

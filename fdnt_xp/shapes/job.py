@@ -125,7 +125,11 @@ class Job:
         psf = replace(self.psf, index=None).take(number)
         size = _of_rows(self.size, chunk.rows)
         return replace(
-            self, psf=psf, weight=self.weight.take(number), size=size, rough=self._rough(number)
+            self,
+            psf=psf,
+            weight=self.weight.only(number),
+            size=size,
+            rough=None if self.rough is None else self.rough.only(number),
         )
 
     def some(self, rows: Rows) -> Job:

@@ -7,7 +7,7 @@ at its own wave numbers `A k` and moved to its centroid, is the test of their me
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from typing import Final
 
@@ -196,12 +196,7 @@ def _common_weight(job: Job) -> Weight:
     kmax = job.weight.kmax
     kmax = xp.where(job.psf.usable, kmax, xp.full_like(kmax, float("inf")))
     number = xp.reshape(xp.argmin(kmax), (1,))
-    widths = job.weight.widths
-    return Weight(
-        psf_part=job.weight.psf_part.take(number),
-        kmax=xp.take(job.weight.kmax, number),
-        widths=None if widths is None else widths.take(number),
-    )
+    return replace(job.weight.only(number), frame=None)
 
 
 def _of_each(weight: Weight, own: Weight, n_gal: int) -> Weight:
@@ -210,9 +205,10 @@ def _of_each(weight: Weight, own: Weight, n_gal: int) -> Weight:
     assert own.frame is not None  # `SampleSky` made the PSF
     first = xp.zeros(n_gal, dtype=xp.int64, device=device_of(weight.kmax))
     return Weight(
-        psf_part=weight.psf_part.take(first),
+        psf_part=weight.psf_part,
         kmax=xp.take(weight.kmax, first),
         frame=xp.broadcast_to(own.frame, (n_gal, 2, 2)),
+        index=first,
     )
 
 

@@ -305,7 +305,7 @@ def _common_weight(job: Job) -> Weight:
     xp = array_namespace(kmax=job.weight.kmax)
     kmax = job.weight.kmax
     kmax = xp.where(job.psf.usable, kmax, xp.full_like(kmax, float("inf")))
-    return job.weight.take(xp.reshape(xp.argmin(kmax), (1,)))
+    return job.weight.only(xp.reshape(xp.argmin(kmax), (1,)))
 
 
 def _from_the_middle(xp: ModuleType, stamps: Array, centroids: Array | None) -> Array | None:
