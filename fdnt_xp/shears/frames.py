@@ -1,7 +1,8 @@
 """A sample seen in counter-sheared frames, chunk by chunk.
 
 Each chunk is transformed once, its synthetic noise drawn once, and then looked at in as many
-frames as are asked for. Nothing of a chunk is kept but where its centroids were.
+frames as are asked for. Nothing of a chunk is kept but where its centroids were, unless they
+are so few that all of them fit the memory of some.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TypeAlias
+from typing import Final, TypeAlias
 
 from fdnt_xp.arrays import Array, Rows, array_namespace, device_of, has_any, rows_of
 from fdnt_xp.flags import FAILED, Flag
@@ -27,6 +28,9 @@ from fdnt_xp.shears.cuts import QUANTITIES, FrameQuantities
 from fdnt_xp.shears.masks import SampleMask
 
 Gamma: TypeAlias = tuple[float, float]  # a trial shear, eta-type
+
+_CHUNKS_HELD: Final = 4
+"""Most chunks of a sample whose transforms are kept from one look at it to the next."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,6 +124,8 @@ class FrameSample:
     the start of the next."""
     _optics: dict[int | None, _Optics] = field(default_factory=dict)
     """Of PSFs that galaxies share, by their number; None for the only one."""
+    _held: dict[int, _Transformed] = field(default_factory=dict)
+    """Chunks of a sample that is small enough."""
     _grids: dict[Gamma, KGrid] = field(default_factory=dict)
     """In the frames that are looked at, for all chunks; not on the sky."""
 
@@ -147,7 +153,7 @@ class FrameSample:
         if self.noise is None:
             return self
         noise = replace(self.noise, pixels=self.noise.pixels.scaled(factor))
-        return replace(self, noise=noise, _solutions=dict(self._solutions), _optics={})
+        return replace(self, noise=noise, _solutions=dict(self._solutions), _optics={}, _held={})
 
     def evaluate(self, gammas: Sequence[Gamma]) -> list[SampleValues]:
         """Return the statistic of all galaxies in each frame."""
@@ -164,14 +170,9 @@ class FrameSample:
         return self.job.chunks(self.n_gal, self.chunk_size)
 
     def _evaluate_chunk(self, number: int, gammas: Sequence[Gamma]) -> Iterator[SampleValues]:
-        chunk = self._chunks[number]
-        job = self.job.of(chunk)
+        held = self._transformed(number)
+        job, noise, optics, galaxies = held.job, held.noise, held.optics, held.galaxies
         grid = job.coarse
-        noise = None if self.noise is None else self.noise.take(chunk.rows)
-        stamps, flags = self._screened(chunk, job)
-        optics = self._optics_of(chunk, job, noise)
-        galaxies = deconvolve(stamps, optics.inverse_transfer, grid)
-        synthetic = None if noise is None else noise.draw(grid)
         known = self._solutions.get(number)
         frame, start = (None, self._start(job, galaxies)) if known is None else known
         for gamma in gammas:
@@ -182,16 +183,37 @@ class FrameSample:
             seen, frame_noise = galaxies, None
             if noise is not None and optics.noise is not None:
                 power = optics.noise.power
-                if synthetic is not None:
+                if held.synthetic is not None:
                     power = optics.noise.made_round(sheared, gamma, self.reach)
-                    seen = synthetic.added_to(galaxies, power - optics.noise.power)
+                    seen = held.synthetic.added_to(galaxies, power - optics.noise.power)
                 frame_noise = FrameNoise(power=power, variance=noise.pixels.variance)
             values = self.statistic.evaluate(sheared, seen, weight, start, frame_noise)
             frame, start = gamma, values.solution
             centroid = job.length * sheared.on_stamp(values.solution[:, -2:])
-            yield _withdrawn(values, flags, centroid, self.unit_length)
+            yield _withdrawn(values, held.flags, centroid, self.unit_length)
         if frame is not None:
             self._solutions[number] = (frame, start)
+
+    def _transformed(self, number: int) -> _Transformed:
+        """Return what a chunk looks like in any frame; a small sample's is made but once."""
+        if number in self._held:
+            return self._held[number]
+        chunk = self._chunks[number]
+        job = self.job.of(chunk)
+        noise = None if self.noise is None else self.noise.take(chunk.rows)
+        stamps, flags = self._screened(chunk, job)
+        optics = self._optics_of(chunk, job, noise)
+        made = _Transformed(
+            job=job,
+            noise=noise,
+            optics=optics,
+            galaxies=deconvolve(stamps, optics.inverse_transfer, job.coarse),
+            synthetic=None if noise is None else noise.draw(job.coarse),
+            flags=flags,
+        )
+        if self.n_gal <= _CHUNKS_HELD * self.chunk_size:
+            self._held[number] = made
+        return made
 
     def _in_frame(self, job: Job, gamma: Gamma) -> tuple[KGrid, Weight]:
         """Return the grid, and the weight that is round there, in the frame of a trial shear.
@@ -282,6 +304,18 @@ class _Optics:
             return cls(inverse_transfer=inverse_transfer, noise=None)
         deconvolved = DeconvolvedNoise.behind(job.psf, noise.pixels, job.coarse, inverse_transfer)
         return cls(inverse_transfer=inverse_transfer, noise=deconvolved)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Transformed:
+    """Galaxies of a chunk, divided by the transfer function, and what goes with them."""
+
+    job: Job
+    noise: SampleNoise | None
+    optics: _Optics
+    galaxies: DeconvolvedStamps
+    synthetic: RoundNoise | None
+    flags: Array
 
 
 def _of_rows(column: Array, rows: Rows) -> Array:
