@@ -255,7 +255,7 @@ def prepare(
         length=3.0 / psf.largest_kmax,
         size=size,
         max_iter=max_iter,
-        rough=None if early is None else make_weight(early, largest_size=1.0 / cell),
+        rough=None if early is None else make_weight(early, 1.0 / cell, every=4),
         rough_kmax=math.pi if early is None else early.largest_kmax,
     )
 
