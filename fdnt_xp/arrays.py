@@ -7,8 +7,10 @@ never learn which library they run on.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import fields, is_dataclass, replace
 from types import ModuleType
-from typing import Any, Final, TypeAlias
+from typing import Any, Final, TypeAlias, TypeVar, cast
 
 import array_api_compat
 import numpy as np
@@ -18,6 +20,7 @@ from fdnt_xp.errors import FdntTypeError, NamespaceError
 Array: TypeAlias = Any
 """An array of any library that follows the Array API standard."""
 Rows: TypeAlias = "slice | Array"
+_Part = TypeVar("_Part")
 """Some of the rows of an array: a range, or an integer array."""
 Device: TypeAlias = Any
 DType: TypeAlias = Any
@@ -111,6 +114,18 @@ def rows_of(array: Array, rows: Rows) -> Array:
     if isinstance(rows, slice):
         return array[rows, ...]
     return array_namespace(rows=rows).take(array, rows, axis=0)
+
+
+def joined(parts: Sequence[_Part]) -> _Part:
+    """Return the rows of all parts, at least one: arrays, or records of arrays field by field."""
+    first: Any = parts[0]
+    if len(parts) == 1:
+        return parts[0]
+    if is_dataclass(first) and not isinstance(first, type):
+        names = [field.name for field in fields(first)]
+        columns = {name: joined([getattr(part, name) for part in parts]) for name in names}
+        return cast("_Part", replace(first, **columns))
+    return cast("_Part", array_namespace(first=first).concat(list(parts), axis=0))
 
 
 def works_in_blocks(array: Array) -> bool:

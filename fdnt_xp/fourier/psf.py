@@ -335,16 +335,15 @@ class Psf:
             distinct=None,
         )
 
-    def transfer(self, grid: KGrid) -> Array:
-        """Return `T(k)` about the flux centroid on the modes of a grid; T(0) = 1.
+    def transfer(self, grid: KGrid, rows: slice = slice(None)) -> Array:
+        """Return `T(k)` of a range of the PSFs about the flux centroid on a grid; T(0) = 1.
 
         Returns
         -------
         array, shape (n_psf, n_k), complex
         """
-        return transform_on_modes(self.image, grid, self.oversampling) * mode_phase(
-            grid, self.centre
-        )
+        transform = transform_on_modes(self.image[rows, :, :], grid, self.oversampling)
+        return transform * mode_phase(grid, self.centre[rows, :])
 
     def inverse_transfer(self, grid: KGrid) -> Array:
         """Return `1/T(k)` inside each PSF's own disc `|k| < kmax` (on the sky), zero outside.
@@ -363,8 +362,7 @@ class Psf:
     def _inverse_of(self, rows: slice, grid: KGrid) -> Array:
         """Return `1/T(k)` of few PSFs."""
         xp = array_namespace(image=self.image)
-        transfer = transform_on_modes(self.image[rows, :, :], grid, self.oversampling)
-        transfer = transfer * mode_phase(grid, self.centre[rows, :])
+        transfer = self.transfer(grid, rows)
         kx, ky = grid.kx[None, :], grid.ky[None, :]
         if self.unit_jacobian is not None:
             frame = wave_frame(self.unit_jacobian[rows, :, :])

@@ -18,15 +18,14 @@ of `W I~` and `(d𝒯/dq) I~` (docs, "Sheared moments are moments").
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import TypeVar
+from dataclasses import dataclass, replace
 
-from fdnt_xp.arrays import Array, Rows, array_namespace, blocks_in_cache, rows_of
+from fdnt_xp.arrays import Array, Rows, array_namespace, blocks_in_cache, joined, rows_of
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.transform import DeconvolvedStamps
 from fdnt_xp.nulltests.forms import ShearedForms, contract, sheared_forms
 from fdnt_xp.nulltests.scaled import scaled_tests
-from fdnt_xp.nulltests.values import MatchedWidth, TestNoise, TestValues
+from fdnt_xp.nulltests.values import MatchedWidth, TestNoise, TestValues, inverse_mean_square
 from fdnt_xp.nulltests.weights import Weight
 
 
@@ -88,9 +87,6 @@ class _PowerMoments:
     wt: Array  # W 𝒯: 0, 2, 4
     tt: Array  # 𝒯²: 0, 2, 4
     wg: Array  # W G: 0
-
-
-_Parts = TypeVar("_Parts", _SizeMoments, _Moments, _Width, _PowerMoments)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,7 +161,7 @@ class NullTests:
             view = block._view(f0, shrink, centroid[rows, :])
             moments.append(self._size_moments(view))
             widths.append(block._width(moments[-1].t_re, f0, shrink))
-        return self._matched_width(frame, _joined(moments), _joined(widths))
+        return self._matched_width(frame, joined(moments), joined(widths))
 
     def noise(self, eta: Array, centroid: Array, inverse_power: Array) -> TestNoise:
         """Return the noise of the raw tests, and the flux, at a solution.
@@ -248,7 +244,7 @@ class NullTests:
                 shared = int(inverse_power.shape[0]) == 1
                 inverse = inverse_power if shared else inverse_power[rows, :]
                 powers.append(self._power_moments(view.psf_factor, gauss, weight, inverse))
-        return _joined(moments), _joined(widths), _joined(powers) if powers else None
+        return joined(moments), joined(widths), joined(powers) if powers else None
 
     def _view(self, f0: Array, shrink: Array, centroid: Array) -> _View:
         square = array_namespace(f0=f0).matmul(f0, self.grid.squares)
@@ -297,11 +293,7 @@ class NullTests:
         if self.fixed_width is not None:
             zero = xp.zeros_like(flux)
             return _Width(width=self.fixed_width, slope=zero, at_bound=zero > 0)
-        # A mean square that noise made negative or tiny asks for the widest weight; and
-        # pixels beyond all range, whose ratio would be NaN, for any.
-        positive = (square > 0) & (flux > 0) & xp.isfinite(flux)
-        safe = xp.where(positive, square, xp.ones_like(square))
-        inverse = xp.where(positive, flux / safe, xp.full_like(flux, 1e30))
+        inverse, positive = inverse_mean_square(flux, square)
         width, slope, at_bound = self.weight.matched_width(inverse, shrink)
         # Of a size that knows nothing of the galaxy there is no slope either.
         slope = xp.where(positive, slope, xp.zeros_like(slope))
@@ -309,20 +301,10 @@ class NullTests:
 
     def _matched_width(self, frame: _Frame, moments: _SizeMoments, width: _Width) -> MatchedWidth:
         """Return the width with its derivatives."""
-        xp = array_namespace(t_re=moments.t_re)
         flux, a2 = moments.t_re[:, 0], moments.t_re[:, 1:]
         square = contract(a2, frame.forms.forms[0])[:, 0]
         if self.fixed_width is not None:
-            zero = xp.zeros_like(flux)
-            return MatchedWidth(
-                width=self.fixed_width,
-                by_parameter=xp.stack([zero] * 4, axis=-1),
-                by_ln_shrink=zero,
-                by_ln_square=zero,
-                flux=flux,
-                square=square,
-                at_bound=zero > 0,
-            )
+            return MatchedWidth.held(self.fixed_width, flux, square)
         by_ln_square = -width.slope * (flux * _inverse(square))
         by_parameter, by_ln_shrink = self._ln_mean_square_slopes(frame, moments, flux, square)
         # At fixed <k'²> the width goes with s²: it is s² times a function of s² <k'²>.
@@ -407,16 +389,6 @@ def shrink_factor(eta: Array) -> Array:
     """Return `s = exp(|eta|/2)`, shape (n_gal,)."""
     xp = array_namespace(eta=eta)
     return xp.exp(0.5 * xp.sqrt(eta[:, 0] ** 2 + eta[:, 1] ** 2))
-
-
-def _joined(parts: list[_Parts]) -> _Parts:
-    """Return the rows of all parts, field by field."""
-    first = parts[0]
-    if len(parts) == 1:
-        return first
-    xp = array_namespace(first=getattr(first, fields(first)[0].name))
-    names = [field.name for field in fields(first)]
-    return type(first)(**{name: xp.concat([getattr(p, name) for p in parts]) for name in names})
 
 
 def _gauss(square: Array, width: Array) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fdnt_xp.arrays import Array
+from fdnt_xp.arrays import Array, array_namespace
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,6 +55,33 @@ class MatchedWidth:
     flux: Array
     square: Array
     at_bound: Array
+
+    @classmethod
+    def held(cls, width: Array, flux: Array, square: Array) -> MatchedWidth:
+        """Return a width that was given, and follows nothing."""
+        xp = array_namespace(flux=flux)
+        zero = xp.zeros_like(flux)
+        return cls(
+            width=width,
+            by_parameter=xp.stack([zero] * 4, axis=-1),
+            by_ln_shrink=zero,
+            by_ln_square=zero,
+            flux=flux,
+            square=square,
+            at_bound=zero > 0,
+        )
+
+
+def inverse_mean_square(flux: Array, square: Array) -> tuple[Array, Array]:
+    """Return `1/<|k'|²>` for the size equation, and where the galaxy has such a number.
+
+    A mean square that noise made negative or tiny asks for the widest weight; and pixels
+    beyond all range, whose ratio would be NaN, for any.
+    """
+    xp = array_namespace(flux=flux)
+    positive = (square > 0) & (flux > 0) & xp.isfinite(flux)
+    safe = xp.where(positive, square, xp.ones_like(square))
+    return xp.where(positive, flux / safe, xp.full_like(flux, 1e30)), positive
 
 
 @dataclass(frozen=True, kw_only=True)

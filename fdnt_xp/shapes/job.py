@@ -154,11 +154,8 @@ class Job:
             psf=self.psf.take(rows),
             weight=self.weight.take(numbers),
             size=size,
-            rough=self._rough(numbers),
+            rough=None if self.rough is None else self.rough.take(numbers),
         )
-
-    def _rough(self, numbers: Array) -> Weight | None:
-        return None if self.rough is None else self.rough.take(numbers)
 
 
 def _of_rows(size: Array | None, rows: Rows) -> Array | None:

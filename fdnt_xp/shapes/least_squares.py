@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Final
 
-from fdnt_xp.arrays import Array, array_namespace, device_of
+from fdnt_xp.arrays import Array, array_namespace, device_of, joined
 
 LARGEST_INFLATION: Final = 20.0
 """Inflation of a variance beyond which a fit is degenerate; a quadrant cut off at the centre makes
@@ -45,11 +45,7 @@ class LinearFit:
     @classmethod
     def concat(cls, parts: Sequence[LinearFit]) -> LinearFit:
         """Join fits, at least one, in the order given."""
-        if len(parts) == 1:
-            return parts[0]
-        xp = array_namespace(inflation=parts[0].inflation)
-        names = [field.name for field in fields(cls)]
-        return cls(**{n: xp.concat([getattr(part, n) for part in parts], axis=0) for n in names})
+        return joined(parts)
 
 
 def least_squares(functions: Array, pixels: Array, ivar: Array) -> LinearFit:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any, Final, Protocol
+from dataclasses import dataclass, replace
+from typing import Final, Protocol
 
-from fdnt_xp.arrays import Array, array_namespace, device_of, has_any
+from fdnt_xp.arrays import Array, array_namespace, device_of, has_any, joined
 from fdnt_xp.flags import FAILED, Flag
 from fdnt_xp.nulltests.dogleg import RootResult, Status
 from fdnt_xp.nulltests.gradient import ellipticity_gradient
@@ -72,17 +72,7 @@ class SolutionNoise:
     @classmethod
     def concat(cls, parts: Sequence[SolutionNoise]) -> SolutionNoise:
         """Join solutions, at least one, in the order given."""
-        return parts[0] if len(parts) == 1 else _joined(parts)
-
-
-def _joined(parts: Sequence[Any]) -> Any:
-    """Return the rows of all parts, field by field, of records within records too."""
-    first = parts[0]
-    if is_dataclass(first) and not isinstance(first, type):
-        names = [g.name for g in fields(first)]
-        return replace(first, **{n: _joined([getattr(part, n) for part in parts]) for n in names})
-    xp = array_namespace(first=first)
-    return xp.concat(list(parts), axis=0)
+        return joined(parts)
 
 
 def white_noise(noise: TestNoise, noise_per_mode: Array) -> SolutionNoise:

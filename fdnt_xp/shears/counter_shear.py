@@ -11,10 +11,10 @@ stays where the PSF has left information.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Final, Protocol
 
-from fdnt_xp.arrays import Array, array_namespace, blocks_in_cache, device_of
+from fdnt_xp.arrays import Array, array_namespace, blocks_in_cache, device_of, joined
 from fdnt_xp.fourier.grid import KGrid
 from fdnt_xp.fourier.sky_grid import SkyGrid
 from fdnt_xp.fourier.transform import DeconvolvedStamps
@@ -211,7 +211,6 @@ def moments_at(
     grid: KGrid, galaxies: DeconvolvedStamps, window: Array, centroid: Array
 ) -> FrameMoments:
     """Return the moments at the root of the dipole that is next to `centroid` (pixels)."""
-    xp = array_namespace(centroid=centroid)
     shared = int(window.shape[0]) == 1
     parts = [
         _moments_near(
@@ -222,11 +221,7 @@ def moments_at(
         )
         for rows in blocks_in_cache(galaxies.re)
     ]
-    columns = {
-        column.name: xp.concat([getattr(part, column.name) for part in parts], axis=0)
-        for column in fields(FrameMoments)
-    }
-    return FrameMoments(**columns)
+    return joined(parts)
 
 
 def _moments_near(

@@ -16,11 +16,16 @@ from fdnt_xp.errors import FdntValueError
 from fdnt_xp.nulltests.scaled import scaled_tests
 from fdnt_xp.nulltests.small_systems import newton_step
 from fdnt_xp.nulltests.tests import NullTests
-from fdnt_xp.nulltests.values import MatchedWidth, TestValues
+from fdnt_xp.nulltests.values import MatchedWidth, TestValues, inverse_mean_square
 from fdnt_xp.nulltests.weights import Weight
 from fdnt_xp.shapes.centroid import wide_weight
 from fdnt_xp.shapes.job import Chunk, Job
-from fdnt_xp.shears.stack_sample import StackSample, StackShapes, refuse_too_few
+from fdnt_xp.shears.stack_sample import (
+    StackSample,
+    StackShapes,
+    common_weight,
+    refuse_too_few,
+)
 
 _PASSES: Final = 30
 """At most: Newton's steps, quadratic but for centroids that follow the shear."""
@@ -76,7 +81,7 @@ def stack_on_sky(job: Job, sample: StackSample) -> StackShapes:
     """
     xp = array_namespace(stamps=sample.stamps)
     enough = _MOVED_LEAST[sample.stamps.dtype == xp.float32]
-    weight = _common_weight(job)
+    weight = replace(common_weight(job), frame=None)
     like = {"dtype": sample.stamps.dtype, "device": device_of(sample.stamps)}
     x, width = xp.zeros((1, 4), **like), xp.full((1,), job.length**2, **like)
     for _ in range(_PASSES):
@@ -119,15 +124,7 @@ def _newton_steps(job: Job, sums: _Sums, x: Array) -> tuple[Array, Array]:
         by_ln_shrink=rows(sums.by_ln_shrink),
         by_width=xp.zeros_like(values),
     )
-    held = MatchedWidth(
-        width=zero,
-        by_parameter=xp.stack([zero] * 4, axis=-1),
-        by_ln_shrink=zero,
-        by_ln_square=zero,
-        flux=zero,
-        square=zero,
-        at_bound=zero > 0,
-    )
+    held = MatchedWidth.held(zero, zero, zero)
     eta = xp.broadcast_to(x[:, :2], (int(zero.shape[0]), 2))
     f, jac = scaled_tests(eta, tests, held, job.length)
     steps, regular = newton_step(xp, f, jac)
@@ -190,15 +187,6 @@ def _turned(tests: Array, frame: Array) -> Array:
     return xp.concat([tests[:, :2, :], xp.matmul(frame, tests[:, 2:4, :]), tests[:, 4:, :]], axis=1)
 
 
-def _common_weight(job: Job) -> Weight:
-    """Return one weight for all: that of the usable PSF whose weight ends first on the sky."""
-    xp = array_namespace(kmax=job.weight.kmax)
-    kmax = job.weight.kmax
-    kmax = xp.where(job.psf.usable, kmax, xp.full_like(kmax, float("inf")))
-    number = xp.reshape(xp.argmin(kmax), (1,))
-    return replace(job.weight.only(number), frame=None)
-
-
 def _of_each(weight: Weight, own: Weight, n_gal: int) -> Weight:
     """Return the common weight in the frame of the pixels of each galaxy."""
     xp = array_namespace(kmax=weight.kmax)
@@ -216,13 +204,7 @@ def _matched_width(weight: Weight, sums: _Sums, x: Array) -> Array:
     """Return the width of the weight that matches the stack, shape (1,)."""
     xp = array_namespace(x=x)
     flux, square = xp.sum(sums.flux, axis=0), xp.sum(sums.square, axis=0)
-    positive = (square > 0) & (flux > 0)
-    # As for one galaxy: what noise made negative asks for the widest weight.
-    inverse = xp.where(
-        positive,
-        flux / xp.where(positive, square, xp.ones_like(square)),
-        xp.full_like(flux, 1e30),
-    )
+    inverse, _ = inverse_mean_square(flux, square)
     shrink = xp.exp(0.5 * xp.sqrt(xp.sum(x[:, :2] ** 2, axis=-1)))
     width, _, _ = weight.matched_width(inverse, shrink)
     return width

@@ -8,6 +8,7 @@ from fdnt_xp.arrays import Array, Rows, array_namespace, count_true, device_of, 
 from fdnt_xp.errors import FdntValueError
 from fdnt_xp.fourier.transform import DeconvolvedStamps, deconvolve
 from fdnt_xp.nulltests.dogleg import DoglegOptions, find_root
+from fdnt_xp.nulltests.weights import Weight
 from fdnt_xp.shapes.centroid import DipoleTests, starting_centroid
 from fdnt_xp.shapes.job import Chunk, Job, screen
 
@@ -109,6 +110,16 @@ class StackSample:
             weights = weights / xp.where(flux > 0, flux, xp.ones_like(flux))
         weights = xp.where(usable, weights, xp.zeros_like(weights))
         return CentredGalaxies(galaxies=galaxies, centres=centres, weights=weights, usable=usable)
+
+
+def common_weight(job: Job) -> Weight:
+    """Return one weight for all: that of the usable PSF whose weight ends first."""
+    if job.weight.shared:
+        return job.weight
+    xp = array_namespace(kmax=job.weight.kmax)
+    kmax = job.weight.kmax
+    kmax = xp.where(job.psf.usable, kmax, xp.full_like(kmax, float("inf")))
+    return job.weight.only(xp.reshape(xp.argmin(kmax), (1,)))
 
 
 def refuse_too_few(weight: Array, n_used: int, n_excluded: int) -> None:

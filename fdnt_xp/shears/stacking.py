@@ -46,7 +46,7 @@ from fdnt_xp.shear import reduced_shear_from_eta
 from fdnt_xp.shears.estimate import ShearEstimate
 from fdnt_xp.shears.sky import SampleSky
 from fdnt_xp.shears.sky_stack import stack_on_sky
-from fdnt_xp.shears.stack_sample import StackSample, StackShapes, refuse_too_few
+from fdnt_xp.shears.stack_sample import StackSample, StackShapes, common_weight, refuse_too_few
 from fdnt_xp.shears.weights import galaxy_weights
 
 _MAX_ITER: Final = 50
@@ -204,7 +204,7 @@ def _solved(job: Job, sample: StackSample) -> StackShapes:
     """
     xp = array_namespace(stamps=sample.stamps)
     enough = _MOVED_LEAST[sample.stamps.dtype == xp.float32]
-    weight = _common_weight(job)
+    weight = common_weight(job)
     shear = xp.zeros_like(sample.weights[:2])
     for _ in range(_PASSES):
         stack = reduce(
@@ -296,16 +296,6 @@ def _measure_means(
         stamp_shape=stamp_shape,
         flags=xp.zeros_like(unknown, dtype=xp.int32),
     )
-
-
-def _common_weight(job: Job) -> Weight:
-    """Return one weight for all: that of the usable PSF whose weight ends first."""
-    if job.weight.shared:
-        return job.weight
-    xp = array_namespace(kmax=job.weight.kmax)
-    kmax = job.weight.kmax
-    kmax = xp.where(job.psf.usable, kmax, xp.full_like(kmax, float("inf")))
-    return job.weight.only(xp.reshape(xp.argmin(kmax), (1,)))
 
 
 def _from_the_middle(xp: ModuleType, stamps: Array, centroids: Array | None) -> Array | None:
